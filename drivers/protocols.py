@@ -1,0 +1,48 @@
+"""The device protocols. Each device has two calls that never wait; all waiting is hidden behind them."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from drivers.samples import AutopilotCommand, AutopilotState, Odometry, ServoCommand, ServoState
+
+
+class Device(Protocol):
+    """Life cycle shared by all devices."""
+
+    async def start(self) -> None:
+        """Connect. Raises ``DeviceError`` with the reason and the remedy when the device cannot be had."""
+
+    async def stop(self) -> None:
+        """Release the device; safe to call twice, and after a failed start."""
+
+
+class AutopilotDevice(Device, Protocol):
+    """The flight controller."""
+
+    def latest(self) -> AutopilotState | None:
+        """Newest state, or None before the first."""
+
+    def command(self, command: AutopilotCommand) -> None:
+        """Hand over one fresh set-point. It is sent at most once."""
+
+
+class OdometryDevice(Device, Protocol):
+    """The visual-inertial tracker."""
+
+    def latest(self) -> Odometry | None:
+        """Newest pose, or None before the first."""
+
+
+class ServoDevice(Device, Protocol):
+    """The bus of five servos."""
+
+    def latest(self) -> ServoState | None:
+        """Newest cycle, or None before the first."""
+
+    def command(self, command: ServoCommand) -> None:
+        """Hand over the goals for the next cycle."""
+
+
+class DeviceError(Exception):
+    """A device cannot be had or was lost; the text says what, where and what to do."""

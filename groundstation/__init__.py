@@ -1,0 +1,1 @@
+"""What a person operates: the command line, the report and the live views."""

@@ -1,0 +1,196 @@
+"""What the blocks of the core hand to each other in one tick."""
+
+from __future__ import annotations
+
+from enum import IntEnum, StrEnum
+
+from msgspec import Struct
+
+from drivers.samples import AutopilotCommand, AutopilotState, Odometry, Quat, ServoCommand, ServoState, Vec3
+
+#: Row-major 3x3 matrix.
+Mat3 = tuple[float, float, float, float, float, float, float, float, float]
+
+
+class Phase(StrEnum):
+    """Phases of the repair mission, and the safe states beside it."""
+
+    PREFLIGHT = "preflight"
+    TAKEOFF = "takeoff"
+    APPROACH = "approach"
+    ALIGN = "align"
+    ADHESIVE = "adhesive"
+    TOOL_CHANGE = "tool_change"
+    TARE = "tare"
+    ADVANCE = "advance"
+    PRESS = "press"
+    RELEASE = "release"
+    RETREAT = "retreat"
+    RETURN = "return"
+    LAND = "land"
+    HOLD = "hold"
+    RETREAT_HOLD = "retreat_hold"
+    RETREAT_LAND = "retreat_land"
+    STOPPED = "stopped"
+
+
+class Request(StrEnum):
+    """What a person may ask of the mission."""
+
+    TAKEOFF = "takeoff"
+    """Take off and hover."""
+    START = "start"
+    """Run the whole mission (takes off first when on the ground)."""
+    HOLD = "hold"
+    RESUME = "resume"
+    RETREAT = "retreat"
+    LAND = "land"
+    KILL = "kill"
+    RESET = "reset"
+    """Back to preflight, on the ground only."""
+
+
+class Action(IntEnum):
+    """What safety demands; the most severe wins."""
+
+    NONE = 0
+    WARN = 1
+    HOLD = 2
+    RETREAT = 3
+    LAND = 4
+    KILL = 5
+
+
+class Inputs(Struct, frozen=True, gc=False):
+    """Everything the core sees in one tick."""
+
+    t_ns: int
+    """Time of the tick."""
+    dt: float
+    """Measured time since the last tick, s (not clamped)."""
+    odometry: Odometry | None
+    autopilot: AutopilotState | None
+    servos: ServoState | None
+    request: Request | None = None
+
+
+class Estimate(Struct, frozen=True, gc=False):
+    """What the core believes about the vehicle. Angles of the body are ZYX Euler angles (roll, pitch, yaw), rad."""
+
+    p_WB: Vec3
+    v_WB: Vec3
+    rpy: Vec3
+    rpy_rate: Vec3
+    R_WB: Mat3
+    w_WB_B: Vec3
+    a_WB: Vec3
+    """Acceleration of the body origin from the IMU, m/s^2, W."""
+    joints: Vec3
+    joint_rates: Vec3
+    tip_W: Vec3
+    """Tip of the active tool, m, W."""
+    force_W: Vec3
+    """Estimated external force on the vehicle, tared, N, W."""
+    force_ee: Vec3
+    """The same in frame E (eq. 17)."""
+    contact_force: float
+    """Estimated compressive force on the pipe along the contact normal, N; positive presses."""
+    in_contact: bool
+    """Output of the contact trigger."""
+    payload: bool
+    """The sleeve is in the gripper."""
+    age_odometry: float
+    age_autopilot: float
+    age_servos: float
+    """Ages of the samples at the tick, s; infinity before the first."""
+    valid: bool
+    """All three devices have told something finite at least once."""
+
+
+class Reference(Struct, frozen=True, gc=False):
+    """What the loop follows in this tick."""
+
+    p: Vec3
+    v: Vec3
+    a: Vec3
+    """Base position, velocity, acceleration, W, compliant offset included."""
+    yaw: float
+    yaw_rate: float
+    yaw_acceleration: float
+    tip: Vec3
+    """Tip of the active tool relative to the arm mount, in the levelled heading frame: forward, left, up, m."""
+    force: float
+    """Desired compressive force, N."""
+    pressing: bool
+    """The force loop is closed."""
+
+
+class Verdict(Struct, frozen=True, gc=False):
+    """What safety says in one tick."""
+
+    action: Action
+    reasons: tuple[str, ...]
+    """Codes of the active conditions, most severe first."""
+
+
+class Severity(StrEnum):
+    """How loud an event is."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class Event(Struct, frozen=True, gc=False):
+    """A sentence a person acts on."""
+
+    t_ns: int
+    code: str
+    severity: Severity
+    text: str
+
+
+class Control(Struct, frozen=True, gc=False):
+    """What the laws want, before the gate."""
+
+    thrust: float
+    """Along +z of B, N."""
+    torque_B: Vec3
+    joint_torque: Vec3
+    attitude: Vec3
+    """Roll, pitch, yaw the attitude law follows, rad."""
+    attitude_rate: Vec3
+    """Their rates."""
+    joints: Vec3
+    """Joint angles the joint law follows, rad."""
+    joint_rates: Vec3
+    w_WB_B: Vec3
+    """Body rates that realise the attitude law, rad/s."""
+    q_WB: Quat
+    """Attitude set-point for the ``attitude`` interface."""
+
+
+class Outputs(Struct, frozen=True, gc=False):
+    """Everything the core says in one tick."""
+
+    phase: Phase
+    phase_time: float
+    verdict: Verdict
+    estimate: Estimate
+    reference: Reference
+    control: Control
+    autopilot: AutopilotCommand
+    servos: ServoCommand
+    clipped: tuple[str, ...]
+    """What the gate changed, by name of the limit."""
+    events: tuple[Event, ...]
+
+
+class Tick(Struct, frozen=True, gc=False):
+    """One cycle: the unit of log, telemetry and replay."""
+
+    index: int
+    revision: int
+    """Revision of the parameter set in force."""
+    inputs: Inputs
+    outputs: Outputs

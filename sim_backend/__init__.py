@@ -1,0 +1,1 @@
+"""Simulated worlds, and the faces that make a world look like hardware."""
