@@ -1,0 +1,43 @@
+"""The desired contact force: from the force at the trigger to a small bias, a quintic ramp to the set force,
+a hold, and a quintic ramp back to the bias before the sleeve is released."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from msgspec import Struct
+
+from onboard.core.spec import spec
+
+
+class Params(Struct, frozen=True, forbid_unknown_fields=True):
+    """Shape of the profile."""
+
+    bias: Annotated[float, spec("N", 0.05, 2.0, "force that keeps contact before and after the ramps")] = 0.3
+    settle: Annotated[float, spec("s", 0.1, 20.0, "time from the trigger to the bias")] = 1.0
+    bias_hold: Annotated[float, spec("s", 0.0, 20.0, "time at the bias before the ramp and after it")] = 1.0
+    ramp: Annotated[float, spec("s", 0.5, 60.0, "duration of each quintic ramp")] = 6.0
+
+
+def quintic(u: float) -> float:
+    """Smooth step from 0 to 1 with zero first and second derivatives at both ends; u is clamped to 0..1."""
+    if u <= 0.0:
+        return 0.0
+    if u >= 1.0:
+        return 1.0
+    return u * u * u * (10.0 + u * (6.0 * u - 15.0))
+
+
+def desired_force(t: float, start: float, force: float, hold: float, params: Params) -> tuple[float, bool]:
+    """Force (N) at ``t`` seconds after the trigger, and whether the profile has ended.
+
+    start: force at the trigger (N); force: set force (N); hold: time it is held (s).
+    """
+    p = params
+    if t < p.settle:
+        return start + (p.bias - start) * quintic(t / p.settle), False
+    t -= p.settle + p.bias_hold
+    if t < p.ramp:
+        return p.bias + (force - p.bias) * quintic(t / p.ramp), False
+    t -= p.ramp + hold
+    return force + (p.bias - force) * quintic(t / p.ramp), t >= p.ramp + p.bias_hold
