@@ -1,0 +1,111 @@
+"""One slot, newest wins: how a driver's thread hands samples to the control loop without either ever waiting."""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import StrEnum
+from threading import Lock
+from typing import Generic, TypeVar
+
+from msgspec import Struct
+
+T = TypeVar("T")
+
+_WINDOW_NS = 1_000_000_000
+_KEPT_NOTICES = 256
+
+
+class MailboxCounts(Struct, frozen=True, gc=False):
+    """What has passed through a mailbox."""
+
+    received: int
+    overwritten: int
+    """Samples that nobody read before the next one came."""
+    rejected: int
+    """Samples that could not be used: not decodable or not finite."""
+    rate: float
+    """Achieved rate, 1/s: of the last whole second, or lower if nothing has come since."""
+
+
+class Mailbox(Generic[T]):
+    """Holds the newest sample. Any thread may put and any thread may read."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._value: T | None = None
+        self._unread = False
+        self._received = 0
+        self._overwritten = 0
+        self._rejected = 0
+        self._window_start: int | None = None
+        self._in_window = 0
+        self._rate = 0.0
+
+    def put(self, value: T, t_ns: int) -> None:
+        """Store a sample that arrived at ``t_ns``; the one before is gone."""
+        with self._lock:
+            self._value = value
+            self._received += 1
+            self._overwritten += self._unread
+            self._unread = True
+            if self._window_start is None:
+                self._window_start = t_ns
+                return
+            self._in_window += 1
+            if t_ns - self._window_start >= _WINDOW_NS:
+                self._rate = self._in_window * 1e9 / (t_ns - self._window_start)
+                self._window_start = t_ns
+                self._in_window = 0
+
+    def reject(self) -> None:
+        """Count a sample that could not be used."""
+        with self._lock:
+            self._rejected += 1
+
+    def latest(self) -> T | None:
+        """The newest sample, or None before the first. Reading does not empty the slot."""
+        with self._lock:
+            self._unread = False
+            return self._value
+
+    def counts(self, t_ns: int) -> MailboxCounts:
+        """Counters and achieved rate at ``t_ns``."""
+        with self._lock:
+            rate = self._rate
+            if self._window_start is not None and t_ns - self._window_start > 2 * _WINDOW_NS:
+                rate = min(rate, self._in_window * 1e9 / (t_ns - self._window_start))
+            return MailboxCounts(self._received, self._overwritten, self._rejected, rate)
+
+
+class Level(StrEnum):
+    """How loud a notice is."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class Notice(Struct, frozen=True, gc=False):
+    """A sentence that a driver tells a person."""
+
+    t_ns: int
+    level: Level
+    text: str
+
+
+class Notices:
+    """The newest sentences of a driver, until somebody takes them. Any thread may tell and any thread may take."""
+
+    def __init__(self) -> None:
+        self._notices: deque[Notice] = deque(maxlen=_KEPT_NOTICES)
+
+    def tell(self, t_ns: int, level: Level, text: str) -> None:
+        """Add one sentence; the oldest goes when nobody takes them."""
+        self._notices.append(Notice(t_ns, level, text))
+
+    def take(self) -> tuple[Notice, ...]:
+        """All sentences not taken yet, oldest first."""
+        taken: list[Notice] = []
+        while self._notices:
+            taken.append(self._notices.popleft())
+        return tuple(taken)
