@@ -91,8 +91,8 @@ def inverse_wrist(arm: Arm, x: float, z: float, elbow_up: bool = False) -> Plane
             raise Unreachable(f"wrist target ({x}, {z}) m in M, elbow {branch}: no reachable point", distance)
         near_x, near_z = wrist(arm, theta_1, theta_2)
         raise Unreachable(
-            f"wrist target ({x:.4f}, {z:.4f}) m in M is unreachable by {_millimetres(distance)} with the elbow "
-            f"{branch}; the nearest reachable point is ({near_x:.4f}, {near_z:.4f})",
+            f"wrist target ({x:.4g}, {z:.4g}) m in M is unreachable by {_millimetres(distance)} with the elbow "
+            f"{branch}; the nearest reachable point is ({near_x:.4g}, {near_z:.4g})",
             distance,
         )
     return (theta_1, theta_2)
