@@ -1,0 +1,609 @@
+"""PX4 over MAVSDK 4: telemetry into mailboxes, one set-point per command, and the wanted state worked towards.
+
+Set-points leave as raw SET_ATTITUDE_TARGET messages, one for each call of ``command``. MAVSDK's offboard plugin is not
+used, because it repeats the last set-point by itself, so that a hung process would never trip PX4's offboard-loss
+failsafe. Telemetry comes through MAVSDK's own thread straight into mailboxes: its asyncio streams queue without bound
+and cost twice as much. (docs/decisions/px4-wire.md)
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from enum import IntEnum
+from math import isfinite, nan
+from time import monotonic_ns
+from typing import Annotated, Any
+
+import mavsdk
+import msgspec
+from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
+from msgspec import Meta, Struct
+
+from drivers.frames import attitude_from_px4, body_from_px4, px4_from_attitude, px4_from_body, world_from_px4
+from drivers.mailbox import Level, Mailbox, MailboxCounts, Notice, Notices
+from drivers.protocols import DeviceError
+from drivers.samples import AutopilotCommand, AutopilotState, Engage, FlightMode, Interface, Landed, Quat, Vec3
+from drivers.thrust import ThrustMap
+
+
+def _meta(unit: str, doc: str, low: float, high: float) -> Meta:
+    return Meta(ge=low, le=high, description=doc, extra={"unit": unit, "in_flight": False})
+
+
+class Px4Settings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Where PX4 is and what is asked of it."""
+
+    thrust: ThrustMap
+    url: Annotated[str, Meta(description="MAVSDK URL: serial:///dev/ttyTHS1:921600, udpin://0.0.0.0:14540, ...")]
+    timeout: Annotated[float, _meta("s", "for each stage of connecting", 0.1, 300.0)] = 10.0
+    rate: Annotated[float, _meta("Hz", "asked for attitude and IMU", 10.0, 1000.0)] = 250.0
+    stream_time: Annotated[float, _meta("s", "set-points run this long before offboard is asked for", 0.2, 10.0)] = 1.0
+    stream_gap: Annotated[float, _meta("s", "a longer pause starts stream_time again", 0.02, 0.5)] = 0.1
+
+
+class Motion(Struct, frozen=True, gc=False):
+    """PX4's own estimate of the body origin's position (m) and velocity (m/s), W."""
+
+    t_ns: int
+    p_WB: Vec3
+    v_WB: Vec3
+
+
+# The fields that are read of each MAVLink message; names are the wire's.
+
+
+class _AttitudeQuaternion(Struct, gc=False):
+    q1: float
+    q2: float
+    q3: float
+    q4: float
+    rollspeed: float
+    pitchspeed: float
+    yawspeed: float
+
+
+class _HighresImu(Struct, gc=False):
+    xacc: float
+    yacc: float
+    zacc: float
+
+
+class _LocalPosition(Struct, gc=False):
+    x: float
+    y: float
+    z: float
+    vx: float
+    vy: float
+    vz: float
+
+
+class _Heartbeat(Struct, gc=False):
+    base_mode: int
+    custom_mode: int
+
+
+class _ExtendedSysState(Struct, gc=False):
+    landed_state: int
+
+
+class _BatteryStatus(Struct):
+    id: int
+    voltages: list[int]
+    battery_remaining: int
+
+
+class _SysStatus(Struct, gc=False):
+    onboard_control_sensors_enabled: int
+    onboard_control_sensors_health: int
+
+
+class _StatusText(Struct, gc=False):
+    severity: int
+    text: str
+    id: int = 0
+    chunk_seq: int = 0
+
+
+class _CommandAck(Struct, gc=False):
+    result: int
+
+
+class _Attitude(Struct, frozen=True, gc=False):
+    t_ns: int
+    q_WB: Quat
+    w_WB_B: Vec3
+
+
+class _Imu(Struct, frozen=True, gc=False):
+    t_ns: int
+    f_B: Vec3
+
+
+class _Mode(Struct, frozen=True, gc=False):
+    armed: bool
+    mode: FlightMode
+
+
+class _Battery(Struct, frozen=True, gc=False):
+    voltage: float
+    remaining: float
+
+
+class _Command(IntEnum):
+    """MAV_CMD."""
+
+    DO_SET_MODE = 176
+    ARM_DISARM = 400
+    SET_MESSAGE_INTERVAL = 511
+
+
+class _Ask(Struct, frozen=True, gc=False):
+    """A command that brings the autopilot nearer to the wanted state."""
+
+    words: str
+    command: _Command
+    params: tuple[float, ...]
+
+
+_AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
+_ONBOARD_COMPUTER = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
+_SYSTEM = 1
+_ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
+_CUSTOM_MODE = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+_PREARM = 0x1000_0000  # MAV_SYS_STATUS_PREARM_CHECK
+_FORCE = 21196.0  # the number that makes PX4 disarm in the air
+_UNUSED_CELL = 65535
+_TEXT_CHUNK = 50
+_MAX_CHUNKED_TEXTS = 16
+_IGNORE_BODY_RATES, _IGNORE_ATTITUDE = 7, 128  # ATTITUDE_TARGET_TYPEMASK
+
+_ACCEPTED = 0
+_RESULTS = {1: "temporarily rejected", 2: "denied", 3: "unsupported", 4: "failed", 6: "cancelled"}  # MAV_RESULT
+
+# PX4's custom mode: main mode in bits 16..23, sub mode in bits 24..31.
+_MODES = {(6, 0): FlightMode.OFFBOARD, (4, 3): FlightMode.HOLD, (4, 6): FlightMode.LAND}
+_LANDED = {1: Landed.ON_GROUND, 2: Landed.IN_AIR, 3: Landed.IN_AIR, 4: Landed.IN_AIR}  # MAV_LANDED_STATE
+
+_OFFBOARD = _Ask("offboard mode", _Command.DO_SET_MODE, (_CUSTOM_MODE, 6.0, 0.0))
+_LAND = _Ask("land mode", _Command.DO_SET_MODE, (_CUSTOM_MODE, 4.0, 6.0))
+_ARM = _Ask("arming", _Command.ARM_DISARM, (1.0, 0.0))
+_DISARM = _Ask("disarming", _Command.ARM_DISARM, (0.0, 0.0))
+_KILL = _Ask("cutting the motors", _Command.ARM_DISARM, (0.0, _FORCE))
+
+#: Messages asked for beside attitude and IMU: name, id, Hz. The heartbeat tells arming and mode.
+_SLOW_STREAMS = (
+    ("HEARTBEAT", 0, 10.0),
+    ("SYS_STATUS", 1, 2.0),
+    ("LOCAL_POSITION_NED", 32, 50.0),
+    ("BATTERY_STATUS", 147, 2.0),
+    ("EXTENDED_SYS_STATE", 245, 10.0),
+)
+
+_PERIOD = 0.05  # of the driver's own task, s
+_ASK_AGAIN_NS = 1_000_000_000
+_FRESH_NS = 200_000_000
+_RATE_CHECK_NS = 3_000_000_000
+_RATE_TOLERANCE = 0.8
+
+
+class Px4:
+    """AutopilotDevice on a PX4, real or emulated.
+
+    ``clock`` gives nanoseconds; samples are stamped with it when they arrive. Construct it anywhere; ``start`` must
+    run in the event loop in which ``stop`` will run. ``command`` and ``latest`` may be called from any one thread.
+    """
+
+    def __init__(self, settings: Px4Settings, clock: Callable[[], int] = monotonic_ns) -> None:
+        self._settings = settings
+        self._clock = clock
+        self._told = Notices()
+        fast = settings.rate
+        self._streams = (("ATTITUDE_QUATERNION", 31, fast), ("HIGHRES_IMU", 105, fast), *_SLOW_STREAMS)
+
+        self._attitude: Mailbox[_Attitude] = Mailbox()
+        self._imu: Mailbox[_Imu] = Mailbox()
+        self._motion: Mailbox[Motion] = Mailbox()
+        self._mode: Mailbox[_Mode] = Mailbox()
+        self._landed: Mailbox[Landed] = Mailbox()
+        self._battery: Mailbox[_Battery] = Mailbox()
+        self._health: Mailbox[bool] = Mailbox()
+        self._boxes: dict[str, Mailbox[Any]] = {
+            "ATTITUDE_QUATERNION": self._attitude,
+            "HIGHRES_IMU": self._imu,
+            "LOCAL_POSITION_NED": self._motion,
+            "HEARTBEAT": self._mode,
+            "EXTENDED_SYS_STATE": self._landed,
+            "BATTERY_STATUS": self._battery,
+            "SYS_STATUS": self._health,
+        }
+        self._texts: dict[int, str] = {}
+
+        self._hub: Any = None
+        self._direct: Any = None
+        self._task: asyncio.Task[None] | None = None
+        self._asking: asyncio.Task[None] | None = None
+        self._linked = True
+        self._intervals_due = False
+        self._rates_checked_ns = 0
+
+        self._wanted: Engage | None = None
+        self._reached = False
+        self._left = False
+        self._commanded_ns = -(10**18)
+        self._stream_began_ns = 0
+        self._asked: dict[_Ask, int] = {}
+        self._refusals: set[str] = set()
+        self._sent = 0
+
+    # -- life cycle -----------------------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Connect, subscribe, and wait until everything that ``latest`` needs has come once.
+
+        Raises DeviceError: bad URL, port taken, nobody there, not a PX4, or a message that never comes.
+        """
+        try:
+            await self._start()
+        except BaseException:
+            await self.stop()
+            raise
+
+    async def _start(self) -> None:
+        url, timeout = self._settings.url, self._settings.timeout
+        loop = asyncio.get_running_loop()
+        mavsdk.log_subscribe(lambda level, text, file, line: True)  # what matters of it is told in notices
+        # The onboard computer shares the vehicle's system id, as PX4 expects of a companion.
+        configuration = mavsdk.Configuration.create_manual(_SYSTEM, _ONBOARD_COMPUTER, True)
+        self._hub = mavsdk.Mavsdk(configuration)
+        configuration.destroy()
+        try:
+            await asyncio.to_thread(self._hub.add_any_connection_with_handle, url)
+        except Exception as error:
+            raise DeviceError(
+                f"autopilot: cannot open {url} ({error}); want for example serial:///dev/ttyTHS1:921600, "
+                "udpin://0.0.0.0:14540 or tcpout://127.0.0.1:5760, and no other process on that port"
+            ) from error
+
+        self._tell(Level.INFO, f"waiting for PX4's heartbeat on {url}")
+        found: asyncio.Future[Any] = loop.create_future()
+
+        def settle(system: object) -> None:
+            if not found.done():
+                found.set_result(system)
+
+        def on_found(system: object) -> None:
+            loop.call_soon_threadsafe(settle, system)
+
+        search = self._hub.first_autopilot_async(timeout, on_found)
+        try:
+            system = await found
+        finally:
+            self._hub.cancel_first_autopilot(search)
+        if system is None:
+            raise DeviceError(
+                f"autopilot: no heartbeat on {url} within {timeout:g} s; is PX4 powered, is MAVLink enabled on that "
+                "port (MAV_1_CONFIG, SER_TEL2_BAUD), and are address and baud rate right?"
+            )
+        if system.autopilot_type() != mavsdk.Autopilot.PX4:
+            raise DeviceError(f"autopilot: {url} answers as {system.autopilot_type().name}; want a PX4")
+
+        system.subscribe_is_connected(self._on_link)
+        self._direct = MavlinkDirect(system)
+        self._subscribe("ATTITUDE_QUATERNION", _AttitudeQuaternion, self._on_attitude)
+        self._subscribe("HIGHRES_IMU", _HighresImu, self._on_imu)
+        self._subscribe("LOCAL_POSITION_NED", _LocalPosition, self._on_motion)
+        self._subscribe("HEARTBEAT", _Heartbeat, self._on_heartbeat)
+        self._subscribe("EXTENDED_SYS_STATE", _ExtendedSysState, self._on_landed)
+        self._subscribe("BATTERY_STATUS", _BatteryStatus, self._on_battery)
+        self._subscribe("SYS_STATUS", _SysStatus, self._on_health)
+        self._subscribe("STATUSTEXT", _StatusText, self._on_text)
+        await self._ask_intervals()
+        await self._wait_for_samples()
+        self._rates_checked_ns = self._clock()
+        self._task = asyncio.create_task(self._work(), name="px4")
+
+    async def _wait_for_samples(self) -> None:
+        needed = ("HEARTBEAT", "ATTITUDE_QUATERNION", "HIGHRES_IMU", "EXTENDED_SYS_STATE", "BATTERY_STATUS")
+        loop = asyncio.get_running_loop()
+        end = loop.time() + self._settings.timeout
+        self._tell(Level.INFO, f"waiting for {', '.join(needed)}")
+        while missing := [name for name in needed if self._boxes[name].latest() is None]:
+            if loop.time() > end:
+                raise DeviceError(
+                    f"autopilot: {', '.join(missing)} never came from {self._settings.url} within "
+                    f"{self._settings.timeout:g} s; is the link fast enough (921600 baud), and is the sensor set up?"
+                )
+            await asyncio.sleep(0.01)
+
+    async def stop(self) -> None:
+        """Close the link. Nothing is sent: landing is the caller's business. Safe to call twice."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+        if self._asking is not None:
+            await asyncio.gather(self._asking, return_exceptions=True)
+        self._direct = None
+        hub, self._hub = self._hub, None
+        if hub is not None:
+            await asyncio.to_thread(hub.destroy)
+
+    # -- what never waits -----------------------------------------------------------------------------------------
+
+    def latest(self) -> AutopilotState | None:
+        """Newest state; its times tell how old it is. None before the first attitude, IMU sample and heartbeat."""
+        attitude, imu, mode = self._attitude.latest(), self._imu.latest(), self._mode.latest()
+        if attitude is None or imu is None or mode is None:
+            return None
+        battery = self._battery.latest()
+        return AutopilotState(
+            t_ns=attitude.t_ns,
+            q_WB=attitude.q_WB,
+            w_WB_B=attitude.w_WB_B,
+            t_imu_ns=imu.t_ns,
+            f_B=imu.f_B,
+            armed=mode.armed,
+            mode=mode.mode,
+            landed=self._landed.latest() or Landed.UNKNOWN,
+            battery_voltage=battery.voltage if battery else nan,
+            battery_remaining=battery.remaining if battery else nan,
+        )
+
+    def command(self, command: AutopilotCommand) -> None:
+        """Send one set-point (while OFFBOARD is wanted) and note the wanted state.
+
+        A set-point with a number that is not finite is not sent, and told. Raises DeviceError before ``start``, after
+        ``stop``, and for Interface.WRENCH, which PX4 does not accept.
+        """
+        if self._direct is None:
+            raise DeviceError("autopilot: command() before start() or after stop()")
+        if command.interface is Interface.WRENCH:
+            raise DeviceError("autopilot: PX4 accepts no body torques; set the interface to attitude or body_rate")
+        now = self._clock()
+        if command.engage is not self._wanted:
+            self._wanted, self._reached, self._left = command.engage, False, False
+            self._asked.clear()
+            self._refusals.clear()
+            if command.engage is Engage.KILL:
+                self._kill()
+        if command.engage is Engage.OFFBOARD:
+            if now - self._commanded_ns > self._settings.stream_gap * 1e9:
+                self._stream_began_ns = now
+            self._commanded_ns = now
+            self._send_set_point(command, now)
+
+    def motion(self) -> Motion | None:
+        """PX4's own position and velocity, or None before the first."""
+        return self._motion.latest()
+
+    def ready_to_arm(self) -> bool:
+        """PX4's own pre-arm checks pass."""
+        return self._health.latest() or False
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Sentences since the last call: PX4's status texts, refusals, loss and return of the link."""
+        return self._told.take()
+
+    def counts(self) -> dict[str, MailboxCounts]:
+        """Counters and achieved rate of every message, by MAVLink name."""
+        now = self._clock()
+        return {name: box.counts(now) for name, box in self._boxes.items()}
+
+    def sent(self) -> int:
+        """Set-points sent so far."""
+        return self._sent
+
+    # -- set-points -----------------------------------------------------------------------------------------------
+
+    def _send_set_point(self, command: AutopilotCommand, now: int) -> None:
+        battery = self._battery.latest()
+        thrust = self._settings.thrust.set_point(command.thrust, battery.voltage if battery else nan)
+        if command.interface is Interface.ATTITUDE:
+            mask, q, w = _IGNORE_BODY_RATES, px4_from_attitude(command.q_WB), (0.0, 0.0, 0.0)
+        else:
+            mask, q, w = _IGNORE_ATTITUDE, (1.0, 0.0, 0.0, 0.0), px4_from_body(command.w_WB_B)
+        if not isfinite(thrust + sum(q) + sum(w)):
+            self._refuse("a set-point that is not finite was not sent")
+            return
+        self._send(
+            "SET_ATTITUDE_TARGET",
+            f'{{"time_boot_ms":{now // 1_000_000 & 0xFFFFFFFF},"target_system":{_SYSTEM},'
+            f'"target_component":{_AUTOPILOT},"type_mask":{mask},"q":[{q[0]},{q[1]},{q[2]},{q[3]}],'
+            f'"body_roll_rate":{w[0]},"body_pitch_rate":{w[1]},"body_yaw_rate":{w[2]},"thrust":{thrust}}}',
+        )
+        self._sent += 1
+
+    def _send(self, name: str, fields: str) -> None:
+        try:
+            self._direct.send_message(MavlinkMessage(message_name=name, fields_json=fields))
+        except MavlinkDirectError as error:
+            self._refuse(f"{name} was not sent: {error.result.name}")
+
+    def _kill(self) -> None:
+        self._send("COMMAND_LONG", _command_json(_KILL))
+
+    # -- the driver's own task ------------------------------------------------------------------------------------
+
+    async def _work(self) -> None:
+        while True:
+            await asyncio.sleep(_PERIOD)
+            self._judge_rates()
+            if self._wanted is Engage.KILL:
+                self._work_towards_kill()
+            elif self._asking is None or self._asking.done():
+                if self._intervals_due and self._linked:
+                    self._intervals_due = False
+                    self._begin(self._ask_intervals())
+                elif (ask := self._next_ask()) is not None:
+                    self._begin(self._try(ask))
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        self._asking = asyncio.create_task(work, name="px4 ask")
+
+    def _work_towards_kill(self) -> None:
+        mode = self._mode.latest()
+        if mode is not None and mode.armed:
+            self._kill()
+        elif not self._reached:
+            self._reached = True
+            self._tell(Level.WARNING, "PX4 has cut the motors")
+
+    def _next_ask(self) -> _Ask | None:
+        """What brings PX4 nearer to the wanted state. A state once reached is not fought for against a pilot."""
+        mode, now = self._mode.latest(), self._clock()
+        if mode is None or not self._linked:
+            return None
+        ask: _Ask | None = None
+        if self._wanted is Engage.OFFBOARD:
+            there = mode.armed and mode.mode is FlightMode.OFFBOARD
+            if not there and self._reached and not self._left:
+                self._left = True
+                self._tell(
+                    Level.WARNING,
+                    f"PX4 has left offboard by itself ({'armed' if mode.armed else 'disarmed'}, mode {mode.mode}); "
+                    "it is not taken back before something else has been wanted",
+                )
+            fresh = now - self._commanded_ns < _FRESH_NS
+            streamed = self._commanded_ns - self._stream_began_ns >= self._settings.stream_time * 1e9
+            if not there and fresh and streamed:
+                ask = _OFFBOARD if mode.mode is not FlightMode.OFFBOARD else _ARM
+        elif self._wanted is Engage.LAND:
+            there = not mode.armed or mode.mode is FlightMode.LAND
+            ask = None if there else _LAND
+        elif self._wanted is Engage.IDLE:
+            there = not mode.armed
+            ask = None if there or self._landed.latest() is not Landed.ON_GROUND else _DISARM
+        else:
+            return None
+        if there and not self._reached:
+            self._reached = True
+            self._tell(Level.INFO, f"PX4 is {'armed' if mode.armed else 'disarmed'}, mode {mode.mode}")
+        if ask is None or self._reached or now - self._asked.get(ask, -_ASK_AGAIN_NS) < _ASK_AGAIN_NS:
+            return None
+        self._asked[ask] = now
+        return ask
+
+    async def _try(self, ask: _Ask) -> None:
+        reason = await self._ask(ask)
+        if reason:
+            self._refuse(f"{ask.words}: {reason}")
+
+    async def _ask(self, ask: _Ask) -> str:
+        """Send a command and wait for its answer; returns what went wrong, or nothing."""
+        message = MavlinkMessage(message_name="COMMAND_LONG", fields_json=_command_json(ask))
+        try:
+            answer = await asyncio.to_thread(self._direct.send_command, message)
+        except MavlinkDirectError as error:
+            return "no answer" if error.result.name == "TIMEOUT" else error.result.name.lower()
+        result = msgspec.json.decode(answer.fields_json, type=_CommandAck).result
+        return "" if result == _ACCEPTED else _RESULTS.get(result, f"MAV_RESULT {result}")
+
+    async def _ask_intervals(self) -> None:
+        for name, number, rate in self._streams:
+            ask = _Ask(f"{name} at {rate:g} Hz", _Command.SET_MESSAGE_INTERVAL, (float(number), round(1e6 / rate)))
+            await self._try(ask)
+
+    def _judge_rates(self) -> None:
+        now = self._clock()
+        if now - self._rates_checked_ns < _RATE_CHECK_NS or not self._linked:
+            return
+        self._rates_checked_ns = now
+        for name in ("ATTITUDE_QUATERNION", "HIGHRES_IMU"):
+            achieved = self._boxes[name].counts(now).rate
+            if achieved < _RATE_TOLERANCE * self._settings.rate:
+                # A PX4 that has rebooted sends at its default rates.
+                self._intervals_due = True
+                self._refuse(f"{name} comes at {achieved:.0f} Hz, asked for {self._settings.rate:g} Hz; asking again")
+
+    # -- what MAVSDK's thread calls -------------------------------------------------------------------------------
+
+    def _subscribe(self, name: str, fields: type[Any], take: Callable[[Any, int], None]) -> None:
+        decode = msgspec.json.Decoder(fields).decode
+        box = self._boxes.get(name)
+
+        def on_message(message: Any, _: object) -> None:
+            now = self._clock()
+            if message.component_id != _AUTOPILOT:
+                return
+            try:
+                take(decode(message.fields_json), now)
+            except (msgspec.DecodeError, ValueError):
+                # A number that is not finite arrives as null.
+                if box is not None:
+                    box.reject()
+
+        self._direct.subscribe_message(name, on_message)
+
+    def _on_attitude(self, m: _AttitudeQuaternion, now: int) -> None:
+        attitude = attitude_from_px4((m.q1, m.q2, m.q3, m.q4))
+        self._attitude.put(_Attitude(now, attitude, body_from_px4((m.rollspeed, m.pitchspeed, m.yawspeed))), now)
+
+    def _on_imu(self, m: _HighresImu, now: int) -> None:
+        self._imu.put(_Imu(now, body_from_px4((m.xacc, m.yacc, m.zacc))), now)
+
+    def _on_motion(self, m: _LocalPosition, now: int) -> None:
+        self._motion.put(Motion(now, world_from_px4((m.x, m.y, m.z)), world_from_px4((m.vx, m.vy, m.vz))), now)
+
+    def _on_heartbeat(self, m: _Heartbeat, now: int) -> None:
+        mode = _MODES.get((m.custom_mode >> 16 & 0xFF, m.custom_mode >> 24 & 0xFF), FlightMode.OTHER)
+        self._mode.put(_Mode(bool(m.base_mode & _ARMED), mode), now)
+
+    def _on_landed(self, m: _ExtendedSysState, now: int) -> None:
+        self._landed.put(_LANDED.get(m.landed_state, Landed.UNKNOWN), now)
+
+    def _on_battery(self, m: _BatteryStatus, now: int) -> None:
+        cells = [v for v in m.voltages if v != _UNUSED_CELL]
+        if m.id != 0 or not cells:
+            return
+        remaining = m.battery_remaining / 100.0 if m.battery_remaining >= 0 else nan
+        self._battery.put(_Battery(sum(cells) / 1000.0, remaining), now)
+
+    def _on_health(self, m: _SysStatus, now: int) -> None:
+        self._health.put(bool(m.onboard_control_sensors_enabled & m.onboard_control_sensors_health & _PREARM), now)
+
+    def _on_text(self, m: _StatusText, now: int) -> None:
+        text = m.text.rstrip("\0")
+        if m.id:
+            # A long text comes in pieces; the one that is not full ends it. A lost end must not pile up.
+            text = (self._texts.pop(m.id, "") if m.chunk_seq else "") + text
+            if len(m.text.rstrip("\0")) == _TEXT_CHUNK:
+                self._texts[m.id] = text
+                if len(self._texts) > _MAX_CHUNKED_TEXTS:
+                    self._texts.pop(next(iter(self._texts)))
+                return
+        level = Level.ERROR if m.severity <= 3 else Level.WARNING if m.severity == 4 else Level.INFO  # MAV_SEVERITY
+        self._told.tell(now, level, f"PX4: {text}")
+
+    def _on_link(self, connected: bool, _: object) -> None:
+        if connected == self._linked:
+            return
+        self._linked = connected
+        if connected:
+            self._intervals_due = True
+            self._tell(Level.WARNING, "the link to PX4 is back")
+        else:
+            self._tell(Level.ERROR, "the link to PX4 is lost: no heartbeat")
+
+    # -- words ----------------------------------------------------------------------------------------------------
+
+    def _tell(self, level: Level, text: str) -> None:
+        self._told.tell(self._clock(), level, f"autopilot: {text}")
+
+    def _refuse(self, text: str) -> None:
+        """Tell a refusal once for each wanted state."""
+        if text not in self._refusals:
+            self._refusals.add(text)
+            self._tell(Level.WARNING, text)
+
+
+def _command_json(ask: _Ask) -> str:
+    fields: dict[str, float | int] = {
+        "target_system": _SYSTEM,
+        "target_component": _AUTOPILOT,
+        "command": int(ask.command),
+        "confirmation": 0,
+    }
+    padded = (*ask.params, *(0.0,) * (7 - len(ask.params)))
+    fields.update({f"param{i}": value for i, value in enumerate(padded, start=1)})
+    return msgspec.json.encode(fields).decode()
