@@ -31,7 +31,7 @@ _REST: Nine = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 class Model:
     """The masses and lengths of one vehicle, packed once, with and without the payload (the sleeve).
 
-    ``payload`` below says whether the sleeve is in the gripper. Tuples in must hold floats.
+    ``payload`` below says whether the sleeve is in the gripper.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
