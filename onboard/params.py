@@ -41,6 +41,10 @@ class Layer(Struct, frozen=True):
     values: dict[str, Any]
     lines: dict[Key, int] = {}
 
+    def under(self, key: str) -> Layer:
+        """The same values as the content of ``key``."""
+        return Layer(self.source, {key: self.values}, {(key, *path): line for path, line in self.lines.items()})
+
 
 class Parameter(Struct, frozen=True):
     """What is declared about one parameter."""
@@ -181,8 +185,9 @@ def _build(
         return result
     if isinstance(node, yaml.SequenceNode) and node.tag == _TAG + "seq":
         return [_build(item, (*path, str(i)), lines, errors, source, inside) for i, item in enumerate(node.value)]
-    text, kind = node.value, node.tag.removeprefix(_TAG)
-    match kind if kind == "str" or re.fullmatch(_SCALARS.get(kind, "(?!)"), text) else None:
+    text = node.value if isinstance(node, yaml.ScalarNode) else ""
+    kind = node.tag.removeprefix(_TAG) if isinstance(node, yaml.ScalarNode) else ""
+    match kind if kind == "str" or re.fullmatch(_SCALARS.get(kind, "(?!)"), text) else "":
         case "str":
             return text
         case "null":
@@ -193,7 +198,7 @@ def _build(
             return _integer(text)
         case "float":
             return float(text.replace(".", "") if text.lower().lstrip("+-") in (".inf", ".nan") else text)
-    errors.append(f"{source}:{line}: {dotted(path)}: {_show(text)} with the tag {node.tag} is not allowed")
+    errors.append(f"{source}:{line}: {dotted(path)}: {text!r:.40} with the tag {node.tag} is not allowed")
     return None
 
 
@@ -475,7 +480,7 @@ class _Reader:
         for key in values:
             if key not in known:
                 bad = True
-                self.fail((*path, str(key)), f": no such parameter; {self._nearest((*path, str(key)), sorted(known))}")
+                self._unknown((*path, str(key)), values[key], sorted(known))
         found: dict[str, Any] = {}
         for field in info.fields:
             here, declared, fallback = (*path, field.name), _declared(field.type), _default(field, default)
@@ -512,19 +517,29 @@ class _Reader:
                     return result
         return NODEFAULT
 
-    def _nearest(self, path: Key, siblings: Sequence[str]) -> str:
-        wrong, leaf = dotted(path), path[-1]
-        names = {dotted((*path[:-1], name)) for name in siblings}
-        names |= {name for name in _names(self.root) if ".N." not in name or not any(map(str.isdecimal, path))}
+    def _unknown(self, path: Key, value: Any, siblings: Sequence[str]) -> None:
+        """Note a key that is not declared, with the nearest that are."""
+        near = {dotted((*path[:-1], name)) for name in siblings}
+        depth = len(path)
+        while isinstance(value, Mapping) and len(value) == 1:  # An option: all of its name is what was meant.
+            ((key, value),) = value.items()
+            path = (*path, key)
+        wrong, leaf, deep = dotted(path), path[-1], len(path) > depth
 
         def likeness(name: str) -> tuple[float, float, str]:
-            whole = SequenceMatcher(None, wrong, name).ratio()
-            last = SequenceMatcher(None, leaf, name.rpartition(".")[2]).ratio()
-            return max(whole, 0.95 * last), whole, name
+            whole = _ratio(wrong, name)
+            last = _ratio(leaf, name.rpartition(".")[2]) * (1.0 if name in near else 0.95)
+            return max(last, whole if deep else _ratio(leaf, name)), whole, name
 
-        near = sorted((likeness(name) for name in names), reverse=True)[:3]
-        close = [name for score, _, name in near if score >= 0.6]
-        return f"nearest: {', '.join(close)}" if close else f"known here: {', '.join(siblings)}"
+        indexed = any(part.isdecimal() for part in path)
+        names = near | {name for name in _names(self.root) if not (indexed and ".N." in name)}
+        best = [name for score, _, name in sorted(map(likeness, names), reverse=True)[:3] if score >= 0.6]
+        hint = f"nearest: {', '.join(best)}" if best else f"known here: {', '.join(siblings)}"
+        self.fail(path, f": no such parameter; {hint}")
+
+
+def _ratio(a: str, b: str) -> float:
+    return SequenceMatcher(None, a, b, autojunk=False).ratio()
 
 
 @functools.cache
