@@ -13,23 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import NODEFAULT, Meta, Struct, structs
 
-from onboard.params import (
-    Change,
-    ConfigError,
-    Layer,
-    compose,
-    defaults,
-    describe,
-    diff,
-    dump_yaml,
-    load,
-    merge,
-    parse_set,
-    parse_yaml,
-    read_yaml,
-    refused_in_flight,
-    to_mapping,
-)
+from onboard.declared import defaults, describe, to_mapping
+from onboard.layers import ConfigError, Layer, merge, parse_set, parse_yaml, read_yaml
+from onboard.params import Change, compose, diff, dump_yaml, load, refused_in_flight
 
 
 def meta(unit: str, low: float, high: float, doc: str, *, in_flight: bool = True) -> Meta:
