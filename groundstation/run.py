@@ -1,0 +1,338 @@
+"""One run as columns of numbers, read from its log alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from onboard.messages import (
+    EVENT,
+    PARAMS,
+    TICK,
+    TIMING,
+    TRUTH,
+    Event,
+    LogError,
+    LogReader,
+    Pipe,
+    Repair,
+    RunInfo,
+    Timing,
+)
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Three = tuple[float, float, float]
+
+
+# What is read of the recorded structs: the same names, only the fields that are used here.
+
+
+class _Stamped(Struct, gc=False):
+    t_ns: int
+
+
+class _Autopilot(Struct, gc=False):
+    t_ns: int
+    landed: str
+
+
+class _Inputs(Struct, gc=False):
+    t_ns: int
+    odometry: _Stamped | None
+    autopilot: _Autopilot | None
+    servos: _Stamped | None
+
+
+class _Estimate(Struct, gc=False):
+    p_WB: Three
+    rpy: Three
+    joints: Three
+    contact_force: float
+    payload: bool
+    age_odometry: float
+    age_autopilot: float
+    age_servos: float
+
+
+class _Reference(Struct, gc=False):
+    p: Three
+    force: float
+    dispensing: bool
+
+
+class _Control(Struct, gc=False):
+    attitude: Three
+    joints: Three
+
+
+class _Outputs(Struct, gc=False):
+    phase: str
+    estimate: _Estimate
+    reference: _Reference
+    control: _Control
+
+
+class _Tick(Struct, gc=False):
+    index: int
+    inputs: _Inputs
+    outputs: _Outputs
+
+
+class _Truth(Struct, gc=False):
+    p_WB: Three
+    q_WB: tuple[float, float, float, float]
+    joints: Three
+    joint_torque: Three
+    rotor_thrust: tuple[float, float, float, float]
+    tip_W: Three
+    needle_W: Three
+    contact_force: float
+    contact_peak: float
+    tip_slip: float
+    sleeve_on_pipe: bool
+    on_ground: bool
+    crashed: str
+
+
+class _Plan(Struct):
+    needle_gap: float
+
+
+class _Rotors(Struct):
+    max_thrust: float
+
+
+class _Servo(Struct):
+    stall_torque: float
+
+
+class _Vehicle(Struct):
+    rotors: _Rotors
+    servo: _Servo
+
+
+class RunConfig(Struct):
+    """The parameters that figures of merit are measured against."""
+
+    pipe: Pipe
+    repair: Repair
+    plan: _Plan
+    vehicle: _Vehicle
+
+
+class _Revision(Struct):
+    config: RunConfig
+
+
+@dataclass(frozen=True)
+class Truths:
+    """What was true at each tick: n rows, NaN where nothing was recorded. SI, W, angles in rad."""
+
+    p: Array
+    rpy: Array
+    joints: Array
+    torque: Array
+    """Joint torques, (n, 3)."""
+    thrust: Array
+    """Rotor thrusts, (n, 4)."""
+    tip: Array
+    needle: Array
+    force: Array
+    """Compressive contact force, (n,)."""
+    peak: Array
+    """Largest contact force since the tick before, (n,)."""
+    slip: Array
+    """Tangential sliding so far, (n,)."""
+    sleeve_on_pipe: bool
+    """At the end."""
+    on_ground: bool
+    """At the end."""
+    crashed: str
+    """Empty, or what happened to the vehicle."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Everything that metrics and report need. Arrays have n rows, one per tick; SI, W, angles in rad."""
+
+    path: Path
+    info: RunInfo
+    config: RunConfig
+    config_yaml: str
+    complete: bool
+    """The log was finished."""
+    index: NDArray[np.int64]
+    t: Array
+    """Time since the first tick, s."""
+    phase: NDArray[np.str_]
+    p: Array
+    rpy: Array
+    joints: Array
+    """Estimates, (n, 3)."""
+    p_ref: Array
+    attitude_ref: Array
+    joints_ref: Array
+    """What the loop follows, (n, 3)."""
+    force_des: Array
+    force_est: Array
+    dispensing: Mask
+    payload: Mask
+    stamps: dict[str, Array]
+    """Time of the newest sample of each device, s on the clock of ``t``."""
+    ages: dict[str, Array]
+    """Its age at the tick, s."""
+    landed: str
+    """Last word of the autopilot's land detector."""
+    truth: Truths | None
+    late: Array
+    busy: Array
+    """Lateness and duration of the ticks of a wall-clock run, s."""
+    events: list[Event] = field(default_factory=list)
+    start_ns: int = 0
+
+    def where(self, *phases: str) -> Mask:
+        """Ticks in any of these phases."""
+        return np.isin(self.phase, phases)
+
+
+DEVICES = ("odometry", "autopilot", "servos")
+
+
+def read_run(path: Path, *, partial: bool = False) -> Run:
+    """Read a whole log.
+
+    Raises:
+        LogError: it cannot be read, or holds no ticks.
+    """
+    ticks: list[float] = []
+    phases: list[str] = []
+    truths: list[float] = []
+    truth_rows: list[int] = []
+    landed = ""
+    last: _Truth | None = None
+    crashed = ""
+    events: list[Event] = []
+    timings: list[Timing] = []
+    config: RunConfig | None = None
+    start_ns = 0
+    nowhere = float("nan")
+    kinds: dict[str, Any] = {TICK: _Tick, TRUTH: _Truth, EVENT: Event, TIMING: Timing, PARAMS: _Revision}
+    with LogReader(path, partial=partial) as log:
+        for topic, message in log.read(kinds):
+            if topic == TICK:
+                inputs, outputs = message.inputs, message.outputs
+                estimate, reference, control = outputs.estimate, outputs.reference, outputs.control
+                if not phases:
+                    start_ns = inputs.t_ns
+                phases.append(outputs.phase)
+                odometry, autopilot, servos = inputs.odometry, inputs.autopilot, inputs.servos
+                ticks += (
+                    message.index,
+                    (inputs.t_ns - start_ns) * 1e-9,
+                    *estimate.p_WB,
+                    *estimate.rpy,
+                    *estimate.joints,
+                    *reference.p,
+                    *control.attitude,
+                    *control.joints,
+                    reference.force,
+                    estimate.contact_force,
+                    reference.dispensing,
+                    estimate.payload,
+                    nowhere if odometry is None else (odometry.t_ns - start_ns) * 1e-9,
+                    nowhere if autopilot is None else (autopilot.t_ns - start_ns) * 1e-9,
+                    nowhere if servos is None else (servos.t_ns - start_ns) * 1e-9,
+                    estimate.age_odometry,
+                    estimate.age_autopilot,
+                    estimate.age_servos,
+                )
+                if autopilot is not None:
+                    landed = autopilot.landed
+            elif topic == TRUTH:
+                truth_rows.append(len(phases) - 1)
+                truths += (
+                    *message.p_WB,
+                    *message.q_WB,
+                    *message.joints,
+                    *message.joint_torque,
+                    *message.rotor_thrust,
+                    *message.tip_W,
+                    *message.needle_W,
+                    message.contact_force,
+                    message.contact_peak,
+                    message.tip_slip,
+                )
+                last = message
+                crashed = crashed or message.crashed
+            elif topic == EVENT:
+                events.append(message)
+            elif topic == TIMING:
+                timings.append(message)
+            elif config is None:
+                config = message.config
+        if not phases or config is None:
+            raise LogError(f"{path}: holds no cycle; the run ended before its first tick")
+        rows = np.array(ticks).reshape(len(phases), -1)
+        return Run(
+            path=path,
+            info=log.info,
+            config=config,
+            config_yaml=log.config_yaml,
+            complete=log.complete,
+            index=rows[:, 0].astype(np.int64),
+            t=rows[:, 1],
+            phase=np.array(phases),
+            p=rows[:, 2:5],
+            rpy=rows[:, 5:8],
+            joints=rows[:, 8:11],
+            p_ref=rows[:, 11:14],
+            attitude_ref=rows[:, 14:17],
+            joints_ref=rows[:, 17:20],
+            force_des=rows[:, 20],
+            force_est=rows[:, 21],
+            dispensing=rows[:, 22] > 0,
+            payload=rows[:, 23] > 0,
+            stamps=dict(zip(DEVICES, rows[:, 24:27].T, strict=True)),
+            ages=dict(zip(DEVICES, rows[:, 27:30].T, strict=True)),
+            landed=landed,
+            truth=_truths(truths, truth_rows, len(phases), last, crashed) if last is not None else None,
+            late=np.array([timing.late for timing in timings]),
+            busy=np.array([timing.busy for timing in timings]),
+            events=events,
+            start_ns=start_ns,
+        )
+
+
+def _truths(values: list[float], rows: list[int], n: int, last: _Truth, crashed: str) -> Truths:
+    table = np.full((n, 26), np.nan)
+    table[rows] = np.array(values).reshape(len(rows), -1)
+    return Truths(
+        p=table[:, 0:3],
+        rpy=euler(table[:, 3:7]),
+        joints=table[:, 7:10],
+        torque=table[:, 10:13],
+        thrust=table[:, 13:17],
+        tip=table[:, 17:20],
+        needle=table[:, 20:23],
+        force=table[:, 23],
+        peak=table[:, 24],
+        slip=table[:, 25],
+        sleeve_on_pipe=last.sleeve_on_pipe,
+        on_ground=last.on_ground,
+        crashed=crashed,
+    )
+
+
+def euler(q: Array) -> Array:
+    """Roll, pitch, yaw (ZYX, rad) of quaternions (w, x, y, z); (n, 4) to (n, 3)."""
+    w, x, y, z = q.T
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.stack((roll, pitch, yaw), axis=1)
