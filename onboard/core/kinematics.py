@@ -88,11 +88,10 @@ def inverse_wrist(arm: Arm, x: float, z: float, elbow_up: bool = False) -> Plane
     if not distance <= TOLERANCE:
         branch = "up" if elbow_up else "down"
         if not isfinite(distance):
-            raise Unreachable(f"wrist target ({x}, {z}) m in M, elbow {branch}: no reachable point", distance)
-        near_x, near_z = wrist(arm, theta_1, theta_2)
+            raise Unreachable(f"wrist target {_point(x, z)} m in M, elbow {branch}: no reachable point", distance)
         raise Unreachable(
-            f"wrist target ({x:.4g}, {z:.4g}) m in M is unreachable by {_millimetres(distance)} with the elbow "
-            f"{branch}; the nearest reachable point is ({near_x:.4g}, {near_z:.4g})",
+            f"wrist target {_point(x, z)} m in M is unreachable by {_millimetres(distance)} with the elbow "
+            f"{branch}; the nearest reachable point is {_point(*wrist(arm, theta_1, theta_2))}",
             distance,
         )
     return (theta_1, theta_2)
@@ -225,6 +224,11 @@ def _onto(angle: float, low: float, high: float) -> float:
     if turned <= high:
         return turned
     return high if turned - high < low + 2.0 * pi - turned else low
+
+
+def _point(x: float, z: float) -> str:
+    """To a tenth of a millimetre, without a negative zero."""
+    return f"({round(x, 4) + 0.0}, {round(z, 4) + 0.0})"
 
 
 def _millimetres(distance: float) -> str:
