@@ -1,0 +1,146 @@
+"""The whole configuration of a run, composed from the files in ``configs/`` and the command line.
+
+Later layers win: ``vehicle.yaml`` (as ``vehicle``), ``controllers/<law>.yaml``, the scenario, ``--set``, ``--seed``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from difflib import SequenceMatcher
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from msgspec import Meta
+
+from onboard.core.params import Params
+from onboard.layers import ConfigError, Layer, parse_set, read_yaml
+from onboard.params import compose, dump_yaml
+from sim_backend.world import WorldParams
+
+#: Beside the packages, in the source tree as well as when installed.
+CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+
+T = TypeVar("T")
+
+
+def _run(meaning: str) -> Meta:
+    return Meta(description=meaning, extra={"unit": "", "in_flight": False})
+
+
+class Config(Params, frozen=True, kw_only=True):
+    """All that is in force in one run."""
+
+    scenario: Annotated[str, _run("name or file of the scenario")] = "paper"
+    law: Annotated[str, _run("name of the controller parameter set")] = "tuned"
+    seed: Annotated[int, Meta(ge=0, le=2**32 - 1), _run("seed of everything random in the world")] = 0
+    world: WorldParams = WorldParams()
+
+
+def load_config(
+    scenario: str = "paper",
+    law: str | None = None,
+    sets: Sequence[str] = (),
+    seed: int | None = None,
+    directory: Path = CONFIGS,
+) -> Config:
+    """Compose and check the configuration of a run.
+
+    ``scenario`` is a name in ``configs/scenarios`` or a path to a file; the ``config.yaml`` of a former run is taken
+    as it stands. ``law`` names a file in ``configs/controllers``; else the scenario says which, else ``tuned``.
+    Raises ConfigError with every error, each naming its file and line or its option.
+    """
+    errors: list[str] = []
+
+    def attempt(function: Callable[..., T], *arguments: Any) -> T | None:
+        try:
+            return function(*arguments)
+        except ConfigError as error:
+            errors.extend(error.errors)
+            return None
+
+    scene = attempt(_scenario, scenario, directory)
+    options = [layer for text in sets if (layer := attempt(_option, text))]
+    layers: list[Layer | None]
+    if scene and "scenario" in scene.values:
+        if law is not None:
+            errors.append(f"--law {law}: {scene.source} is the full configuration of a run and holds its own law")
+        layers = [scene]
+    else:
+        given, origin = ("tuned", "default law") if law is None else (law, f"--law {law}")
+        if law is None and scene and "law" in scene.values:
+            given, origin = scene.values["law"], scene.source
+        layers = [
+            attempt(_vehicle, directory),
+            attempt(_controller, given, origin, directory),
+            scene,
+            Layer("--scenario", {"scenario": scenario}),
+            Layer("--law", {"law": given}),
+        ]
+    if errors:
+        raise ConfigError(errors)
+    options += [] if seed is None else [Layer(f"--seed {seed}", {"seed": seed})]
+    return compose(Config, [*filter(None, layers), *options])
+
+
+def load_config_file(path: Path) -> Config:
+    """Read a full configuration, such as the ``config.yaml`` of a run."""
+    return compose(Config, [read_yaml(path)])
+
+
+def dump_config(config: Config) -> str:
+    """The text of a run's ``config.yaml``: every parameter in force; reads back to the identical set."""
+    return dump_yaml(config)
+
+
+def scenario_names(directory: Path = CONFIGS) -> list[str]:
+    """Names of the scenarios that exist."""
+    return _names(directory / "scenarios")
+
+
+def law_names(directory: Path = CONFIGS) -> list[str]:
+    """Names of the controller parameter sets that exist."""
+    return _names(directory / "controllers")
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(path.stem for path in folder.glob("*.yaml"))
+
+
+def _scenario(scenario: str, directory: Path) -> Layer:
+    if "/" in scenario or "\\" in scenario or scenario.endswith((".yaml", ".yml")):
+        return read_yaml(Path(scenario))
+    return _named("scenario", scenario, f"--scenario {scenario}", directory / "scenarios")
+
+
+def _controller(law: Any, origin: str, directory: Path) -> Layer:
+    return _named("law", law, origin, directory / "controllers")
+
+
+def _vehicle(directory: Path) -> Layer:
+    path = directory / "vehicle.yaml"
+    if not path.is_file():
+        raise ConfigError([f"{path}: not found; run from the source tree, or install the package with its configs"])
+    return read_yaml(path, _shown(path)).under("vehicle")
+
+
+def _option(text: str) -> Layer:
+    layer = parse_set(text)
+    for name in ("scenario", "law"):
+        if name in layer.values:
+            raise ConfigError([f"--set {text}: the {name} chooses files; give it as --{name}"])
+    return layer
+
+
+def _named(kind: str, name: Any, origin: str, folder: Path) -> Layer:
+    names = _names(folder)
+    if name not in names:
+        names.sort(key=lambda known: -SequenceMatcher(None, str(name), known).ratio())
+        known = f"there are: {', '.join(names)}" if names else f"there is none in {_shown(folder)}"
+        raise ConfigError([f"{origin}: no {kind} of the name {str(name)!r}; {known}"])
+    path = folder / f"{name}.yaml"
+    return read_yaml(path, _shown(path))
+
+
+def _shown(path: Path) -> str:
+    """The path as a person would write it here."""
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
