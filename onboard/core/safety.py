@@ -386,7 +386,7 @@ WORDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType({
     "tipped": ("armed, and tilt above {p.tipped:g} rad", "The vehicle has tipped over: motors cut."),
     "fence": (
         "outside of the fence {p.fence_low} to {p.fence_high} m in flight",
-        "Outside of the fence at {f.position[0]:.1f}, {f.position[1]:.1f}, {f.position[2]:.1f} m: land, or fly it back.",
+        "Outside of the fence at {f.position[0]:.1f}, {f.position[1]:.1f}, {f.position[2]:.1f} m: land or fly back.",
     ),
     "fence_breached": (
         "outside of the fence by more than {p.fence_margin:g} m in flight",
