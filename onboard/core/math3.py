@@ -186,6 +186,12 @@ def body_torque_from_euler(rpy: Vec3, torque: Vec3) -> Vec3:
     return (roll, cf * pitch + sf * across, cf * across - sf * pitch)
 
 
+def vertical(q: Quat) -> Vec3:
+    """z of the outer frame in the turned one: the third row of the rotation matrix."""
+    w, x, y, z = q
+    return (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+
+
 def tilt(R: Mat3) -> float:
     """Angle between z of the turned frame and the vertical, rad."""
     return atan2(hypot(R[2], R[5]), R[8])

@@ -113,16 +113,31 @@ class Reference(Struct, frozen=True, gc=False):
     p: Vec3
     v: Vec3
     a: Vec3
-    """Base position, velocity, acceleration, W, compliant offset included."""
+    """Base position, velocity, acceleration, m, W, compliant offset included."""
     yaw: float
     yaw_rate: float
     yaw_acceleration: float
-    tip: Vec3
-    """Tip of the active tool relative to the arm mount, in the levelled heading frame: forward, left, up, m."""
+    wrist: tuple[float, float]
+    """Wrist relative to the arm mount in the levelled heading frame: forward, up, m."""
+    wrist_rate: tuple[float, float]
+    elevation: float
+    """Elevation of the gripper's direction in the levelled heading frame, rad (the needle's is pi/2 more)."""
+    elevation_rate: float
+    pump: float
+    gripper: float
+    """Goal angles of the pump and gripper servos, rad."""
+    lift: float
+    """Share of the actuation in force: 0 standing, 1 flying, in between while the motors spool up or down."""
     force: float
     """Desired compressive force, N."""
     pressing: bool
     """The force loop is closed."""
+    dispensing: bool
+    """The needle sweeps the arc of the pipe."""
+    compliant_acceleration: float
+    compliant_velocity: float
+    compliant_displacement: float
+    """State of the admittance along the heading, m/s^2, m/s, m."""
 
 
 class Verdict(Struct, frozen=True, gc=False):

@@ -18,7 +18,7 @@ from onboard.core.fuzzy import LEVELS, PITCH_TERMS, Params, evaluate
 PRINTED = Params()
 SYMMETRIC = Params(output_low=-0.004, output_high=0.004)
 
-steady = settings(deadline=None, derandomize=True, max_examples=500)
+steady = settings(max_examples=500)
 errors = st.floats(-3.0, 3.0)
 pitches = st.floats(radians(-5.0), radians(15.0))
 heights = st.lists(st.floats(0.0, 1.0), min_size=5, max_size=5)
@@ -34,7 +34,7 @@ def brute_centroid(clips: list[float], points: int = 200_001) -> float:
     return float(np.trapezoid(x * union, x) / np.trapezoid(union, x))
 
 
-@settings(deadline=None, derandomize=True, max_examples=60)
+@settings(max_examples=60)
 @given(heights.filter(lambda clips: max(clips) > 0.05))
 def test_centroid_in_closed_form_is_the_integral(clips: list[float]) -> None:
     assert fuzzy.centroid(clips) == pytest.approx(brute_centroid(clips), abs=1e-6)
@@ -119,8 +119,8 @@ def test_the_fall_is_inherent_to_min_max() -> None:
 @given(errors, pitches, st.floats(-1e-6, 1e-6), st.floats(-1e-6, 1e-6))
 def test_no_jump(force_error: float, pitch: float, d_error: float, d_pitch: float) -> None:
     step = evaluate(force_error + d_error, pitch + d_pitch, SYMMETRIC) - evaluate(force_error, pitch, SYMMETRIC)
-    # Steepest measured slopes: 1.1 ranges per newton, 32 ranges per radian.
-    assert abs(step) <= spread(SYMMETRIC) * (1.5 * abs(d_error) + 40.0 * abs(d_pitch)) + 1e-15
+    # Steepest slopes found: 1.03 ranges per newton, 20 ranges per radian.
+    assert abs(step) <= spread(SYMMETRIC) * (1.2 * abs(d_error) + 25.0 * abs(d_pitch)) + 1e-15
 
 
 GRID = [(e, p) for e in np.linspace(-2.3, 2.3, 24).tolist() for p in np.linspace(-1.0, 10.0, 23).tolist()]

@@ -18,7 +18,7 @@ CONFIG = Path(__file__).parents[2] / "configs" / "vehicle.yaml"
 ARM = msgspec.yaml.decode(CONFIG.read_bytes(), type=Vehicle).arm
 LOW, HIGH = ARM.joint_min, ARM.joint_max
 
-steady = settings(deadline=None, derandomize=True, max_examples=300)
+steady = settings(max_examples=300)
 branches = st.booleans()
 tools = st.sampled_from(Tool)
 joints = st.tuples(*(st.floats(low, high) for low, high in zip(LOW, HIGH, strict=True)))

@@ -15,7 +15,7 @@ pitches = st.floats(-1.5, 1.5)
 numbers = st.floats(-100.0, 100.0)
 vectors = st.tuples(numbers, numbers, numbers)
 eulers = st.tuples(angles, pitches, angles)
-steady = settings(deadline=None, derandomize=True, max_examples=200)
+steady = settings(max_examples=200)
 
 
 def close(a: tuple[float, ...], b: tuple[float, ...], tolerance: float = 1e-9) -> bool:

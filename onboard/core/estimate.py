@@ -1,0 +1,176 @@
+"""From samples to what the core believes: body, joints, tip, contact force, and how old it all is.
+
+Attitude, angular velocity and specific force come from the autopilot, position and velocity from odometry,
+joints from the servos. A sample that is not finite is not used: its device falls silent, and its age tells.
+"""
+
+from __future__ import annotations
+
+from math import acos, hypot, inf
+from typing import TYPE_CHECKING, Annotated
+
+from msgspec import Struct
+
+from drivers.samples import AutopilotState, Odometry, ServoState, Vec3
+from onboard.core import contact_trigger, kinematics, math3, observer
+from onboard.core.derived import Derived
+from onboard.core.guidance import Progress
+from onboard.core.kinematics import Tool
+from onboard.core.spec import spec
+from onboard.core.types import Estimate, Inputs, Phase, Reference
+
+if TYPE_CHECKING:
+    from onboard.core.params import Params as AllParams
+
+NEAR_PIPE = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE)
+
+
+class Params(Struct, frozen=True, forbid_unknown_fields=True):
+    """How samples are used."""
+
+    extrapolate_max: Annotated[float, spec("s", 0.0, 0.2, "position is carried forward by velocity for at most this age")] = 0.06
+    released_at: Annotated[float, spec("rad", -3.14, 3.14, "measured gripper angle beyond which the sleeve is gone")] = 0.8
+
+
+class State(Struct, frozen=True, gc=False):
+    """The newest usable samples, and the states of the observer and of the trigger."""
+
+    odometry: Odometry | None = None
+    autopilot: AutopilotState | None = None
+    servos: ServoState | None = None
+    observer: observer.State = observer.State()
+    trigger: contact_trigger.State = contact_trigger.State()
+    payload: bool = True
+    finite: bool = True
+    """All samples of this tick were finite."""
+    jump: float = 0.0
+    """Step of the newest odometry sample beyond what its velocity explains, m."""
+    reset: bool = False
+    """The tracker's reset counter has changed with the newest sample."""
+    disagreement: float = 0.0
+    """Angle between the verticals of odometry and autopilot, rad."""
+
+
+def step(
+    state: State,
+    inputs: Inputs,
+    phase: Phase,
+    progress: Progress,
+    reference: Reference | None,
+    thrust: float,
+    derived: Derived,
+    params: AllParams,
+    dt: float,
+) -> tuple[State, Estimate]:
+    """One tick. phase, progress, reference, thrust: of the tick before."""
+    finite = True
+    jump, reset, disagreement = 0.0, False, state.disagreement
+    odometry, autopilot, servos = state.odometry, state.autopilot, state.servos
+    new = inputs.odometry
+    if new is not None and new is not odometry:
+        if _finite(new.p_WB, new.v_WB, new.q_WB):
+            if odometry is not None and new.t_ns != odometry.t_ns:
+                jump = _jump(odometry, new)
+                reset = new.reset_counter != odometry.reset_counter
+            odometry = new
+        else:
+            finite = False
+    told = inputs.autopilot
+    if told is not None and told is not autopilot:
+        if _finite(told.q_WB, told.w_WB_B, told.f_B):
+            autopilot = told
+        else:
+            finite = False
+    bus = inputs.servos
+    if bus is not None and bus is not servos:
+        if _finite(bus.position, bus.velocity, bus.current):
+            servos = bus
+        else:
+            finite = False
+
+    now = inputs.t_ns
+    ages = (
+        (now - odometry.t_ns) * 1e-9 if odometry is not None else inf,
+        (now - autopilot.t_ns) * 1e-9 if autopilot is not None else inf,
+        (now - servos.t_ns) * 1e-9 if servos is not None else inf,
+    )
+    if odometry is None or autopilot is None or servos is None:
+        estimate = _nothing(state.payload, ages)
+        waiting = State(
+            odometry, autopilot, servos, state.observer, state.trigger, state.payload, finite, jump, reset, disagreement
+        )
+        return waiting, estimate
+
+    vehicle, site = params.vehicle, derived.site
+    R = math3.matrix_from_quat(autopilot.q_WB)
+    rpy = math3.euler_from_quat(autopilot.q_WB)
+    w = autopilot.w_WB_B
+    ax, ay, az = math3.rotate(R, autopilot.f_B)
+    acceleration = (ax, ay, az - vehicle.gravity)
+    v = odometry.v_WB
+    ahead = min(max(0.0, ages[0]), params.estimate.extrapolate_max)
+    p = (
+        odometry.p_WB[0] + ahead * v[0],
+        odometry.p_WB[1] + ahead * v[1],
+        odometry.p_WB[2] + ahead * v[2],
+    )
+    joints, rates = servos.position[:3], servos.velocity[:3]
+    payload = state.payload and not (phase is Phase.RELEASE and servos.position[4] > params.estimate.released_at)
+
+    desired = reference.a if reference is not None else (0.0, 0.0, 0.0)
+    watched = observer.step(
+        state.observer, acceleration, desired, thrust, (R[2], R[5], R[8]), derived.model.mass(payload), vehicle.gravity,
+        params.observer, dt,
+    )  # fmt: skip
+    if progress.taring:
+        watched = observer.accumulate(watched)
+        if progress.tared:
+            watched = observer.finish_tare(watched)
+    force = observer.external_force(watched, params.observer)
+    n = site.normal
+    compression = -(force[0] * n[0] + force[1] * n[1])
+
+    tip = kinematics.tip_W(vehicle.arm, p, R, joints, Tool.NEEDLE if phase is Phase.ADHESIVE else Tool.GRIPPER)
+    trigger = state.trigger
+    if phase in NEAR_PIPE:
+        crack = site.crack
+        distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
+        trigger = contact_trigger.step(trigger, distance, compression, params.contact, dt)
+    elif trigger.contact or trigger.time:
+        trigger = contact_trigger.State()
+
+    estimate = Estimate(
+        p, v, rpy, math3.euler_rates_from_body(rpy, w), R, w, acceleration, joints, rates, tip, force,
+        math3.rotate_transposed(kinematics.tool_rotation(joints[2]), math3.rotate_transposed(R, force)),
+        compression, trigger.contact, payload, ages[0], ages[1], ages[2], True,
+    )  # fmt: skip
+    if odometry is not state.odometry:
+        x, y, z = math3.vertical(odometry.q_WB)
+        disagreement = acos(min(1.0, max(-1.0, x * R[6] + y * R[7] + z * R[8])))
+    return State(odometry, autopilot, servos, watched, trigger, payload, finite, jump, reset, disagreement), estimate
+
+
+def _finite(*groups: tuple[float, ...]) -> bool:
+    total = 0.0
+    for group in groups:
+        total += sum(group)
+    return total - total == 0.0
+
+
+def _jump(before: Odometry, after: Odometry) -> float:
+    """Distance (m) between the new position and the one that the mean velocity leads to."""
+    time = (after.t_ns - before.t_ns) * 1e-9
+    a, b, u, v = before.p_WB, after.p_WB, before.v_WB, after.v_WB
+    return hypot(
+        b[0] - a[0] - 0.5 * time * (u[0] + v[0]),
+        b[1] - a[1] - 0.5 * time * (u[1] + v[1]),
+        b[2] - a[2] - 0.5 * time * (u[2] + v[2]),
+    )
+
+
+_O: Vec3 = (0.0, 0.0, 0.0)
+
+
+def _nothing(payload: bool, ages: tuple[float, float, float]) -> Estimate:
+    identity = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    return Estimate(_O, _O, _O, _O, identity, _O, _O, _O, _O, _O, _O, _O, 0.0, False, payload, *ages, False)

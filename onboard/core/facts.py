@@ -1,0 +1,125 @@
+"""From what the core believes to the facts that safety and mission decide on."""
+
+from __future__ import annotations
+
+from math import hypot
+from typing import TYPE_CHECKING
+
+from drivers.samples import Engage, FlightMode, Landed
+from onboard.core import limits, math3, mission, safety
+from onboard.core.guidance import Progress
+from onboard.core.types import Estimate, Inputs, Phase, Reference, Verdict
+
+if TYPE_CHECKING:
+    from onboard.core import estimate as estimating
+    from onboard.core.derived import Derived
+    from onboard.core.params import Params
+
+#: Rise above the place of takeoff that counts as flying, m.
+LIFT_OFF = 0.05
+_CONTACT = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE, Phase.RETREAT, Phase.RETREAT_HOLD, Phase.RETREAT_LAND)
+_NO_POSITION = (0.0, 0.0, 0.0)
+
+
+def airborne(before: bool, seen: estimating.State, believed: Estimate, home_height: float, lift: float) -> bool:
+    """Whether the vehicle is off the ground: it has risen with its motors on, and has not landed since."""
+    told = seen.autopilot
+    if told is None or not told.armed:
+        # a report of "disarmed" in the air must not hide that the vehicle is there
+        return before and believed.p_WB[2] > home_height + LIFT_OFF
+    if before:
+        return not (lift < 1.0 and told.landed is Landed.ON_GROUND)
+    return lift > 0.5 and believed.p_WB[2] > home_height + LIFT_OFF
+
+
+def for_safety(
+    seen: estimating.State, believed: Estimate, inputs: Inputs, phase: Phase, flying: bool, engaged_before: bool,
+    reference: Reference | None, joints: tuple[float, float, float],
+) -> safety.Facts:  # fmt: skip
+    """Facts of one tick. joints: the reference of the joint law, rad."""
+    odometry, autopilot, servos = seen.odometry, seen.autopilot, seen.servos
+    if odometry is None or autopilot is None or servos is None:
+        return safety.Facts(
+            phase, flying, False, False, False, believed.age_odometry, believed.age_autopilot, believed.age_servos,
+            0.0, False, 0.0 if odometry is None else odometry.confidence, 0.0, _NO_POSITION, 0.0, 0.0, 0, 0.0,
+            5.0, 5.0, True, 0.0, 99.0, 1.0, inputs.dt, seen.finite, False,
+        )  # fmt: skip
+    f = believed.force_W
+    now = believed.joints
+    errors = servos.error
+    return safety.Facts(
+        phase,
+        flying,
+        autopilot.armed,
+        phase in _CONTACT,
+        phase is Phase.PRESS and reference is not None and reference.pressing,
+        believed.age_odometry,
+        believed.age_autopilot,
+        believed.age_servos,
+        seen.jump,
+        seen.reset,
+        odometry.confidence,
+        math3.tilt(believed.R_WB),
+        believed.p_WB,
+        believed.contact_force,
+        hypot(f[0], f[1], f[2]),
+        errors[0] | errors[1] | errors[2] | errors[3] | errors[4],
+        max(servos.temperature),
+        min(servos.voltage),
+        max(servos.voltage),
+        servos.torque_on,
+        max(abs(now[0] - joints[0]), abs(now[1] - joints[1]), abs(now[2] - joints[2])) if flying else 0.0,
+        autopilot.battery_voltage,
+        autopilot.battery_remaining,
+        inputs.dt,
+        seen.finite,
+        engaged_before and autopilot.mode is not FlightMode.OFFBOARD,
+        seen.disagreement,
+    )
+
+
+def for_mission(
+    seen: estimating.State, believed: Estimate, progress: Progress, phase: Phase, flying: bool, verdict: Verdict,
+    derived: Derived, params: Params,
+) -> mission.Facts:  # fmt: skip
+    """Facts of one tick. progress: of the reference in the tick before, in the same phase."""
+    told = seen.autopilot
+    armed = told is not None and told.armed
+    grounded = told is not None and told.landed is Landed.ON_GROUND
+    site = derived.site
+    crack, tip, n = site.crack, believed.tip_W, site.normal
+    beyond = (tip[0] - crack[0]) * n[0] + (tip[1] - crack[1]) * n[1]
+    return mission.Facts(
+        ready=believed.valid and grounded and not armed and not verdict.reasons,
+        engaged=armed and told is not None and told.mode is FlightMode.OFFBOARD,
+        airborne=flying,
+        arrived=progress.arrived,
+        triggered=believed.in_contact,
+        pressed=progress.pressed,
+        released=progress.released,
+        tared=progress.tared,
+        landed=grounded and not flying,
+        disarmed=not armed,
+        in_contact=believed.in_contact,
+        contact_lost=phase is Phase.PRESS and not believed.in_contact,
+        overtravel=phase is Phase.ADVANCE and beyond > params.plan.overtravel,
+        blind=safety.blind(verdict),
+        offboard_lost=safety.yielded(verdict),
+    )
+
+
+def permission(phase: Phase, engage: Engage, believed: Estimate, aloft: bool) -> limits.Permission:
+    """What the gate may let through. aloft: away from the ground, with the motors spooled up."""
+    return limits.Permission(
+        motors=phase not in (Phase.PREFLIGHT, Phase.STOPPED),
+        joints=believed.valid and engage is not Engage.KILL,
+        floor=aloft and phase is not Phase.LAND,
+    )
+
+
+def measured(seen: estimating.State) -> limits.Measured:
+    """Where the gate takes its rates up from."""
+    return limits.Measured(
+        seen.autopilot.q_WB if seen.autopilot is not None else None,
+        seen.servos.position if seen.servos is not None else None,
+    )

@@ -1,0 +1,420 @@
+"""The reference of the loop: jerk-limited motion, force profile and compliant offset, phase by phase.
+
+Each phase has a plan of legs, made when the phase begins from where the reference is at that moment (its
+velocity and acceleration included), so that no change of phase makes the reference jump. Pressing adds the
+desired force and the admittance's displacement along the pipe's normal.
+"""
+
+from __future__ import annotations
+
+from math import cos, hypot, sin, sqrt
+from typing import TYPE_CHECKING, Annotated
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from drivers.vehicle import Vehicle
+from onboard.core import admittance, force_profile, fuzzy, kinematics, plan
+from onboard.core.math3 import wrap_angle
+from onboard.core.plan import Eight, Leg, Path, Site
+from onboard.core.spec import spec
+from onboard.core.types import Estimate, Phase, Reference
+
+if TYPE_CHECKING:
+    from onboard.core.derived import Derived
+    from onboard.core.params import Params as AllParams
+
+ZERO: Eight = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+STANDING = (Phase.PREFLIGHT, Phase.STOPPED)
+PRESSING = (Phase.PRESS, Phase.RELEASE)
+BACKING_OUT = (Phase.RETREAT, Phase.RETREAT_HOLD, Phase.RETREAT_LAND)
+READY_BACK = 0.06
+SMOOTH_START = 1.0
+
+
+class Params(Struct, frozen=True, forbid_unknown_fields=True):
+    """When a motion counts as done, and the tools' angles."""
+
+    settle_time: Annotated[float, spec("s", 0.0, 10.0, "time within the tolerances that ends a motion")] = 0.5
+    settle_position: Annotated[float, spec("m", 0.002, 0.5, "tolerance of the base's position")] = 0.04
+    settle_yaw: Annotated[float, spec("rad", 0.005, 0.5, "tolerance of the yaw")] = 0.035
+    tare_settle: Annotated[float, spec("s", 0.0, 20.0, "rest before the tare")] = 2.0
+    tare_time: Annotated[float, spec("s", 0.5, 30.0, "time the tare is averaged over")] = 3.0
+    force_down: Annotated[float, spec("s", 0.2, 10.0, "time in which the force is taken back before a retreat")] = 1.0
+    release_hold: Annotated[float, spec("s", 0.0, 10.0, "time at the bias after the gripper has opened")] = 1.0
+    gripper_closed: Annotated[float, spec("rad", -3.14, 3.14, "gripper servo angle that holds the sleeve")] = 0.0
+    gripper_open: Annotated[float, spec("rad", -3.14, 3.14, "gripper servo angle that lets it go")] = 1.0
+    stop_acceleration: Annotated[float, spec("m/s^2", 0.1, 3.0, "mean deceleration of a broken-off motion")] = 0.5
+
+
+class State(Struct, frozen=True, gc=False):
+    """The plan in force and how far along it the reference is."""
+
+    phase: Phase
+    legs: tuple[Leg, ...]
+    index: int
+    time: float
+    """Time in the leg, s."""
+    start: Eight
+    start_rate: Eight
+    start_acceleration: Eight
+    """Where the leg began; the rates are None-like zeros for a leg that began at rest."""
+    moving: bool
+    """The leg began in motion."""
+    at: Eight
+    rate: Eight
+    acceleration: Eight
+    home: Eight
+    settled: float
+    """Time within the tolerances since the last leg ended, s."""
+    clock: float
+    """Time since the last leg of the phase ended, s."""
+    lift: float
+    press_time: float
+    """Time since the trigger, s."""
+    press_start: float
+    """Estimated force at the trigger, N."""
+    force: float
+    easing: float
+    """Time since the force is being taken back for a retreat, s; negative when it is not."""
+    admittance: admittance.State
+    released_for: float
+    """Time since the gripper was seen open, s."""
+
+
+class Progress(Struct, frozen=True, gc=False):
+    """What mission and observer need to know of the reference."""
+
+    arrived: bool = False
+    pressed: bool = False
+    released: bool = False
+    taring: bool = False
+    tared: bool = False
+    grounded: bool = False
+    """Landing: the motors have been spooled down."""
+
+
+def initial() -> State:
+    """Before the first sample: nothing is followed."""
+    return State(
+        phase=Phase.PREFLIGHT, legs=(), index=0, time=0.0, start=ZERO, start_rate=ZERO, start_acceleration=ZERO,
+        moving=False, at=ZERO, rate=ZERO, acceleration=ZERO, home=ZERO, settled=0.0, clock=0.0, lift=0.0,
+        press_time=0.0, press_start=0.0, force=0.0, easing=-1.0, admittance=admittance.State(), released_for=0.0,
+    )  # fmt: skip
+
+
+def measured(estimate: Estimate, pump: float, vehicle: Vehicle) -> Eight:
+    """Where the vehicle is, in the coordinates of a leg."""
+    mount = vehicle.arm.mount
+    pitch = estimate.rpy[1]
+    wx, wz = kinematics.wrist(vehicle.arm, estimate.joints[0], estimate.joints[1])
+    bx, bz = wx + mount[0], wz + mount[2]
+    c, s = cos(pitch), sin(pitch)
+    x, y, z = estimate.p_WB
+    return (
+        x, y, z, estimate.rpy[2],
+        c * bx + s * bz - mount[0], -s * bx + c * bz - mount[2], estimate.joints[2] - pitch, pump,
+    )  # fmt: skip
+
+
+def step(
+    state: State,
+    estimate: Estimate,
+    phase: Phase,
+    engaged: bool,
+    pump: float,
+    derived: Derived,
+    params: AllParams,
+    dt: float,
+) -> tuple[State, Reference, Progress]:
+    """One tick of the reference.
+
+    engaged: the autopilot follows our set-points; pump: measured angle of the pump servo, rad.
+    """
+    own, site = params.guidance, derived.site
+    if phase is not state.phase:
+        state = _enter(state, phase, estimate, pump, derived, params)
+    if phase in STANDING:
+        here = measured(estimate, pump, params.vehicle)
+        state = replace(state, at=here, home=here)
+        return state, _reference(state, params, 0.0, False), Progress()
+
+    lift, easing, clock, settled = state.lift, state.easing, state.clock, state.settled
+    if phase is Phase.TAKEOFF:
+        if engaged and lift < 1.0:
+            lift = min(1.0, lift + dt / params.plan.spool)
+        paused = lift < 1.0
+    else:
+        paused = False
+    if phase is Phase.LAND and _touched_down(state, estimate):
+        lift = max(0.0, lift - dt / params.plan.spool)
+
+    force, pressing, pressed = state.force, phase in PRESSING, False
+    press_time = state.press_time
+    if phase is Phase.PRESS:
+        press_time += dt
+        force, pressed = force_profile.desired_force(
+            press_time, state.press_start, params.repair.force, params.repair.hold, params.force_profile
+        )
+    elif phase is Phase.RELEASE:
+        force = params.force_profile.bias
+    elif easing >= 0.0:
+        easing += dt
+        if easing < own.force_down:
+            pressing, paused = True, True
+            force = state.press_start * (1.0 - force_profile.quintic(easing / own.force_down))
+        else:
+            state = replace(_start_from(state, _base_measured(state.at, estimate)), press_start=0.0)
+            state = replace(state, legs=_plan(phase, state, site, params))
+            easing, force = -1.0, 0.0
+    else:
+        force = 0.0
+
+    ended = state.index >= len(state.legs)
+    if not ended and not paused:
+        state = _follow(state, site, params, dt)
+        ended = state.index >= len(state.legs)
+    if ended and easing < 0.0:
+        clock += dt
+        near = _near(state, estimate, own)
+        settled = settled + dt if near else 0.0
+    released_for = state.released_for
+    if phase is Phase.RELEASE and not estimate.payload:
+        released_for += dt
+
+    compliant, acceleration = state.admittance, 0.0
+    if pressing:
+        wanted = fuzzy.evaluate(force - estimate.contact_force, max(0.0, estimate.rpy[1]), params.fuzzy)
+        compliant, acceleration = admittance.step(compliant, wanted, params.admittance, dt)
+    state = State(
+        phase, state.legs, state.index, state.time, state.start, state.start_rate, state.start_acceleration, state.moving,
+        state.at, state.rate, state.acceleration, state.home, settled, clock, lift, press_time, state.press_start,
+        force, easing, compliant, released_for,
+    )  # fmt: skip
+    arrived = ended and easing < 0.0 and settled >= own.settle_time and lift >= 1.0
+    taring = phase is Phase.TARE and arrived and clock >= own.tare_settle
+    progress = Progress(
+        arrived,
+        pressed,
+        released_for >= own.release_hold,
+        taring,
+        taring and clock >= own.tare_settle + own.tare_time,
+        phase is Phase.LAND and lift <= 0.0,
+    )
+    return state, _reference(state, params, acceleration, pressing), progress
+
+
+def _reference(state: State, params: AllParams, compliant: float, pressing: bool) -> Reference:
+    x, y, z, yaw, wx, wz, elevation, pump = state.at
+    vx, vy, vz, yaw_rate, vwx, vwz, elevation_rate, _ = state.rate
+    ax, ay, az, yaw_acceleration, _, _, _, _ = state.acceleration
+    offset = state.admittance
+    if pressing:
+        nx, ny = cos(yaw), sin(yaw)
+        x, y = x + offset.displacement * nx, y + offset.displacement * ny
+        vx, vy = vx + offset.velocity * nx, vy + offset.velocity * ny
+        ax, ay = ax + compliant * nx, ay + compliant * ny
+    own = params.guidance
+    open_gripper = state.phase is Phase.RELEASE or (state.released_for > 0.0)
+    leg = state.legs[state.index] if state.index < len(state.legs) else None
+    return Reference(
+        (x, y, z), (vx, vy, vz), (ax, ay, az), yaw, yaw_rate, yaw_acceleration, (wx, wz), (vwx, vwz), elevation,
+        elevation_rate, pump, own.gripper_open if open_gripper else own.gripper_closed, state.lift, state.force, pressing,
+        leg is not None and leg.pumping, compliant, offset.velocity, offset.displacement,
+    )  # fmt: skip
+
+
+def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived: Derived, params: AllParams) -> State:
+    """The state with the plan of ``phase``, begun where the reference is."""
+    before, site = state.phase, derived.site
+    if before in STANDING:
+        state = _start_from(replace(state, released_for=0.0), measured(estimate, pump, params.vehicle))
+    force = state.force
+    easing = -1.0
+    if phase is Phase.PRESS:
+        # the translation law pushes as it did at the trigger: with what it feeds forward, and an offset for the rest
+        push = min(max(0.0, estimate.contact_force), params.repair.force)
+        lead = (1.0 - params.backstepping.feed_forward) * push / derived.normal_stiffness
+        x, y, z, *rest = _base_measured(state.at, estimate)
+        n = site.normal
+        state = _start_from(state, (x + lead * n[0], y + lead * n[1], z, *rest))
+        state = replace(state, press_time=0.0, press_start=push, admittance=admittance.State())
+        force = push
+    elif phase is not Phase.RELEASE:
+        if before in PRESSING and phase in BACKING_OUT:
+            easing = 0.0
+            state = replace(state, press_start=force)
+        elif before in PRESSING or state.easing >= 0.0:
+            state = _start_from(state, _base_measured(state.at, estimate))
+            state = replace(state, admittance=admittance.State())
+    state = replace(state, phase=phase, force=force, easing=easing, settled=0.0, clock=0.0, index=0, time=0.0)
+    if phase is Phase.RELEASE or easing >= 0.0:
+        return replace(state, legs=())
+    state = replace(state, start=state.at, start_rate=state.rate, start_acceleration=state.acceleration, moving=any(state.rate))
+    return replace(state, legs=_plan(phase, state, site, params))
+
+
+def _start_from(state: State, at: Eight) -> State:
+    """The state at rest at ``at``."""
+    return replace(
+        state, at=at, rate=ZERO, acceleration=ZERO, start=at, start_rate=ZERO, start_acceleration=ZERO, moving=False,
+        index=0, time=0.0, admittance=admittance.State(),
+    )  # fmt: skip
+
+
+def _base_measured(at: Eight, estimate: Estimate) -> Eight:
+    """``at`` with the horizontal position of the base as measured: where contact has put it."""
+    return (estimate.p_WB[0], estimate.p_WB[1], *at[2:])
+
+
+def _plan(phase: Phase, state: State, site: Site, params: AllParams) -> tuple[Leg, ...]:
+    """Legs of one phase from where the reference is."""
+    p, at = params.plan, state.at
+    path = Path(at, p)
+    n = site.normal
+    if phase is Phase.TAKEOFF:
+        path.to(base=(at[0], at[1], state.home[2] + p.takeoff_height))
+    elif phase is Phase.APPROACH:
+        ready = (p.needle_reach - READY_BACK, 0.0, -_HALF_TURN)
+        for point in plan.route(at, plan.beside(site, site.far), params.pipe, site, p):
+            path.to(base=point, arm=ready)
+    elif phase is Phase.ALIGN:
+        path.to(yaw=site.yaw).to(base=plan.beside(site, site.needle), slow=True)
+    elif phase is Phase.ADHESIVE:
+        _adhesive(path, site, params)
+    elif phase is Phase.TOOL_CHANGE:
+        path.to(base=plan.beside(site, site.near), slow=True).to(arm=(p.press_reach, 0.0, 0.0))
+    elif phase is Phase.TARE:
+        path.to(base=plan.beside(site, site.near), yaw=site.yaw, arm=(p.press_reach, 0.0, 0.0), slow=True)
+    elif phase is Phase.ADVANCE:
+        way = p.gap + p.overtravel
+        path.add(_uniform(at, (way * n[0], way * n[1], 0.0), p.advance_speed))
+    elif phase in BACKING_OUT:
+        path.to(base=(at[0] - p.retreat * n[0], at[1] - p.retreat * n[1], at[2]), slow=True)
+    elif phase is Phase.RETURN:
+        home = (state.home[0], state.home[1], state.home[2] + p.takeoff_height)
+        for point in plan.route(at, home, params.pipe, site, p):
+            path.to(base=point, arm=(*p.fold, 0.0))
+        path.to(yaw=state.home[3])
+    elif phase is Phase.LAND:
+        ground = state.home[2]
+        path.to(base=(at[0], at[1], max(ground + 0.35, min(at[2], ground + 0.35))), arm=(*p.fold, 0.0))
+        path.add(_uniform(path.at, (0.0, 0.0, -0.60), p.descent_speed))
+    elif phase is Phase.HOLD:
+        vx, vy, vz = state.rate[:3]
+        time = max(1.0, 2.0 * hypot(vx, vy, vz) / params.guidance.stop_acceleration)
+        target = tuple(a + 0.5 * time * v for a, v in zip(at, state.rate, strict=True))
+        path.add(Leg(target, time))  # type: ignore[arg-type]
+    return path.legs
+
+
+def _adhesive(path: Path, site: Site, params: AllParams) -> None:
+    """Around the pipe at a distance to one end of the arc, in, along the arc with the pump, out, and back."""
+    p = params.plan
+    needle = params.pipe.radius + p.needle_gap
+    clear = needle + p.needle_clear
+    first, last = site.arc
+
+    def sweep(begin: float, end: float, radius: float, speed: float, pump: float) -> None:
+        wx, wz, elevation = plan.wrist_on_arc(end, radius, params.pipe.radius, params.vehicle, p)
+        at = path.at
+        length = abs(end - begin) * (radius + params.vehicle.arm.needle)
+        time = plan.duration(length, speed, 0.2, 0.6)
+        path.add(Leg((*at[:4], wx, wz, elevation, at[7] + pump), time, arc=(begin, end, radius), pumping=pump != 0.0))
+
+    def to(angle: float, radius: float) -> None:
+        path.to(arm=plan.wrist_on_arc(angle, radius, params.pipe.radius, params.vehicle, p), slow=True)
+
+    to(0.0, clear)
+    sweep(0.0, first, clear, 2.0 * p.arm_speed, 0.0)
+    to(first, needle)
+    scale = (needle + params.vehicle.arm.needle) / needle
+    sweep(first, last, needle, p.needle_speed * scale, p.pump_ratio * needle * (last - first))
+    to(last, clear)
+    sweep(last, 0.0, clear, 2.0 * p.arm_speed, 0.0)
+    path.to(arm=(p.needle_reach - READY_BACK, 0.0, -_HALF_TURN))
+
+
+def _uniform(at: Eight, way: tuple[float, float, float], speed: float) -> Leg:
+    target = (at[0] + way[0], at[1] + way[1], at[2] + way[2], *at[3:])
+    return Leg(target, hypot(*way) / speed + 0.5 * SMOOTH_START, uniform=True)
+
+
+_HALF_TURN = 1.5707963267948966
+
+
+def _follow(state: State, site: Site, params: AllParams, dt: float) -> State:
+    """Advance along the plan by dt."""
+    leg = state.legs[state.index]
+    time = state.time + dt
+    total = leg.duration
+    if time >= total:
+        return replace(
+            state, index=state.index + 1, time=0.0, at=leg.target, rate=ZERO, acceleration=ZERO, start=leg.target,
+            start_rate=ZERO, start_acceleration=ZERO, moving=False,
+        )  # fmt: skip
+    u = time / total
+    if leg.uniform:
+        part = min(1.0, time / SMOOTH_START)
+        speed = 1.0 / (total - 0.5 * SMOOTH_START)
+        s = speed * (SMOOTH_START * part**4 * (2.5 + part * (part - 3.0)) + max(0.0, time - SMOOTH_START))
+        ds = speed * force_profile.quintic(part)
+        dds = speed * 30.0 * (part * (1.0 - part)) ** 2 / SMOOTH_START
+    else:
+        v = u * (1.0 - u)
+        s = u * u * u * (10.0 + u * (6.0 * u - 15.0))
+        ds = 30.0 * v * v / total
+        dds = 60.0 * v * (1.0 - 2.0 * u) / (total * total)
+    a, b = state.start, leg.target
+    d0, d1, d2, d3, d4, d5, d6, d7 = (
+        b[0] - a[0], b[1] - a[1], b[2] - a[2], b[3] - a[3], b[4] - a[4], b[5] - a[5], b[6] - a[6], b[7] - a[7]
+    )  # fmt: skip
+    at: Eight = (
+        a[0] + d0 * s, a[1] + d1 * s, a[2] + d2 * s, a[3] + d3 * s, a[4] + d4 * s, a[5] + d5 * s, a[6] + d6 * s, a[7] + d7 * s
+    )  # fmt: skip
+    rate: Eight = (d0 * ds, d1 * ds, d2 * ds, d3 * ds, d4 * ds, d5 * ds, d6 * ds, d7 * ds)
+    acceleration: Eight = (d0 * dds, d1 * dds, d2 * dds, d3 * dds, d4 * dds, d5 * dds, d6 * dds, d7 * dds)
+    if leg.arc is not None:
+        begin, end, radius = leg.arc
+        angle, angle_rate = begin + (end - begin) * s, (end - begin) * ds
+        wx, wz, elevation = plan.wrist_on_arc(angle, radius, params.pipe.radius, params.vehicle, params.plan)
+        rho = radius + params.vehicle.arm.needle
+        at = (*at[:4], wx, wz, elevation, at[7])
+        rate = (*rate[:4], rho * sin(angle) * angle_rate, rho * cos(angle) * angle_rate, -angle_rate, rate[7])
+    if state.moving:
+        at, rate, acceleration = _with_start_motion(state, at, rate, acceleration, u, total)
+    return replace(state, time=time, at=at, rate=rate, acceleration=acceleration)
+
+
+def _with_start_motion(
+    state: State, at: Eight, rate: Eight, acceleration: Eight, u: float, total: float
+) -> tuple[Eight, Eight, Eight]:
+    """Add what the velocity and acceleration at the start of the leg contribute; both fade out to its end."""
+    u2 = u * u
+    u3 = u2 * u
+    h = total * (u - 6.0 * u3 + 8.0 * u2 * u2 - 3.0 * u2 * u3)
+    dh = 1.0 - 18.0 * u2 + 32.0 * u3 - 15.0 * u2 * u2
+    ddh = (-36.0 * u + 96.0 * u2 - 60.0 * u3) / total
+    k = 0.5 * total * total * (u2 - 3.0 * u3 + 3.0 * u2 * u2 - u2 * u3)
+    dk = 0.5 * total * (2.0 * u - 9.0 * u2 + 12.0 * u3 - 5.0 * u2 * u2)
+    ddk = 0.5 * (2.0 - 18.0 * u + 36.0 * u2 - 20.0 * u3)
+    v, a = state.start_rate, state.start_acceleration
+
+    def plus(values: Eight, of_rate: float, of_acceleration: float) -> Eight:
+        return tuple(x + of_rate * y + of_acceleration * z for x, y, z in zip(values, v, a, strict=True))  # type: ignore[return-value]
+
+    return plus(at, h, k), plus(rate, dh, dk), plus(acceleration, ddh, ddk)
+
+
+def _near(state: State, estimate: Estimate, params: Params) -> bool:
+    p = estimate.p_WB
+    x, y, z = p[0] - state.at[0], p[1] - state.at[1], p[2] - state.at[2]
+    return (
+        sqrt(x * x + y * y + z * z) < params.settle_position
+        and abs(wrap_angle(estimate.rpy[2] - state.at[3])) < params.settle_yaw
+    )
+
+
+def _touched_down(state: State, estimate: Estimate) -> bool:
+    """The reference has gone well below the vehicle, which no longer sinks: it stands; or it is being spooled down."""
+    return state.lift < 1.0 or (estimate.p_WB[2] - state.at[2] > 0.06 and abs(estimate.v_WB[2]) < 0.05)

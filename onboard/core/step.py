@@ -1,0 +1,78 @@
+"""The core: one pure function from the samples of a tick to its commands."""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+from drivers.samples import Engage
+from onboard.core import actuation, control, estimate, facts, guidance, limits, mission, safety
+from onboard.core.derived import derive
+from onboard.core.params import Params
+from onboard.core.types import Event, Inputs, Outputs, Reference
+
+class State(Struct, frozen=True, gc=False):
+    """All that the core remembers from one tick to the next."""
+
+    estimate: estimate.State
+    safety: safety.State
+    mission: mission.State
+    guidance: guidance.State
+    progress: guidance.Progress
+    reference: Reference | None
+    control: control.State
+    limits: limits.State
+    thrust: float
+    """Thrust commanded in the last tick, N."""
+    airborne: bool
+    engaged: bool
+    """The autopilot followed our set-points, and was asked to."""
+
+
+def initial_state(params: Params) -> State:
+    """On the ground, before the first sample."""
+    return State(
+        estimate.State(), safety.initial(), mission.initial(), guidance.initial(), guidance.Progress(), None,
+        control.State(), limits.State(), 0.0, False, False,
+    )  # fmt: skip
+
+
+def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State, Outputs]:
+    """Advance the core by dt seconds. Same arguments, same bits."""
+    derived = derive(params)
+    dt = min(params.dt_max, max(params.dt_min, dt))
+    before = state.mission.phase
+    lift = state.reference.lift if state.reference is not None else 0.0
+
+    seen, believed = estimate.step(
+        state.estimate, inputs, before, state.progress, state.reference, state.thrust, derived, params, dt
+    )
+    flying = facts.airborne(state.airborne, seen, believed, state.guidance.home[2], lift)
+    dangers = facts.for_safety(
+        seen, believed, inputs, before, flying, state.engaged, state.reference, state.control.compensation.joints
+    )
+    safe, verdict, alarms = safety.step(state.safety, dangers, params.safety, dt)
+    known = facts.for_mission(seen, believed, state.progress, before, flying, verdict, derived, params)
+    task, said = mission.step(state.mission, inputs.request, verdict.action, known, params.mission, dt)
+    guided, reference, progress = guidance.step(
+        state.guidance, believed, task.phase, known.engaged, _pump(seen), derived, params, dt
+    )
+    laws, wanted = control.step(
+        state.control, believed, reference, flying and reference.lift >= 1.0, task.phase in estimate.NEAR_PIPE,
+        derived, params, dt,
+    )  # fmt: skip
+    engage = mission.engage(task, known)
+    autopilot = actuation.autopilot_command(wanted, engage, params.interface)
+    servos = actuation.servo_command(wanted, reference, params.joints, params.joint_current)
+    gate, autopilot, servos, clipped = limits.step(
+        state.limits, autopilot, servos, facts.permission(task.phase, engage, believed, flying and reference.lift >= 1.0),
+        facts.measured(seen), derived.bounds, dt,
+    )  # fmt: skip
+    events = tuple(Event(inputs.t_ns, *text) for text in (*alarms, *said)) if alarms or said else ()
+    return (
+        State(seen, safe, task, guided, progress, reference, laws, gate, autopilot.thrust, flying, known.engaged and engage is Engage.OFFBOARD),
+        Outputs(task.phase, task.phase_time, verdict, believed, reference, wanted, autopilot, servos, clipped, events),
+    )
+
+
+def _pump(seen: estimate.State) -> float:
+    return seen.servos.position[3] if seen.servos is not None else 0.0

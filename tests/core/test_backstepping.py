@@ -1,0 +1,102 @@
+"""The translation law: equations as printed, bounded adaptation, compliance, no jump at take-over."""
+
+from __future__ import annotations
+
+from math import cos, isfinite, sin
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from onboard.core import backstepping
+from onboard.core.backstepping import Params, State
+from tests.core.strategies import number, vector
+
+MASS, WEIGHT, DT = 2.4, 23.5, 0.004
+PRINTED = Params(compliant=False, freeze_in_contact=False, feed_forward=0.0, leak=0.0)
+
+
+def law(state=State(), error=(0.0, 0.0, 0.0), rate=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, 0.0), heading=0.0,
+        contact=0.0, adapt=True, hold=False, force=0.0, params=PRINTED):  # fmt: skip
+    normal = (cos(heading), sin(heading))
+    return backstepping.step(
+        state, error, rate, acceleration, MASS, WEIGHT, normal, contact, adapt, hold, force, params, DT
+    )
+
+
+@given(vector(2.0), vector(2.0), vector(3.0), vector(3.0))
+
+def test_is_equations_2_and_3(error, rate, acceleration, disturbance):
+    p = PRINTED
+    alpha, gamma = (p.alpha, p.alpha, p.alpha_z), (p.gamma, p.gamma, p.gamma_z)
+    _, force, v = law(State(disturbance), error, rate, acceleration, adapt=False)
+    for i in range(3):
+        e2 = rate[i] + alpha[i] * error[i]
+        expected = acceleration[i] - alpha[i] * rate[i] - gamma[i] * e2 - error[i]
+        assert v[i] == pytest.approx(expected, abs=1e-9)
+        assert force[i] == pytest.approx(MASS * expected + disturbance[i] + (WEIGHT if i == 2 else 0.0), abs=1e-9)
+
+
+def test_adaptation_opposes_the_augmented_error_and_is_bounded():
+    state, _, _ = law(error=(0.1, 0.0, -0.2))
+    assert state.disturbance[0] < 0.0 < state.disturbance[2]
+    assert state.disturbance[0] == pytest.approx(-PRINTED.beta * PRINTED.alpha * 0.1 * DT)
+    for _ in range(200_000):
+        state, _, _ = law(state, error=(5.0, 0.0, -5.0))
+    assert state.disturbance == (-PRINTED.bound, 0.0, PRINTED.bound)
+
+
+def test_leak_forgets():
+    state = State((1.0, 0.0, 0.0))
+    for _ in range(1000):
+        state, _, _ = law(state, params=Params(leak=0.5))
+    assert state.disturbance[0] == pytest.approx(2.718281828 ** (-0.5 * 1000 * DT), rel=1e-2)
+
+
+@given(vector(1e6), vector(1e6), vector(1e6), number(3.2), st.floats(0.0, 1.0), st.booleans(), number(10.0))
+
+def test_finite_in_finite_out(error, rate, acceleration, heading, contact, hold, force):
+    state, tau, v = law(State(), error, rate, acceleration, heading, contact, True, hold, force, Params())
+    assert all(isfinite(x) for x in (*tau, *v, *state.disturbance))
+    assert all(abs(x) <= Params().bound for x in state.disturbance)
+
+
+@given(vector(1.0), vector(1.0), vector(1.0), number(3.2), st.floats(0.0, 1.0))
+
+def test_is_odd_but_for_the_weight(error, rate, acceleration, heading, contact):
+    def flip(v):
+        return tuple(-x for x in v)
+
+    _, tau, _ = law(error=error, rate=rate, acceleration=acceleration, heading=heading, contact=contact, params=Params())
+    _, back, _ = law(
+        error=flip(error), rate=flip(rate), acceleration=flip(acceleration), heading=heading, contact=contact, params=Params()
+    )
+    for i in range(3):
+        assert tau[i] + back[i] == pytest.approx(2.0 * WEIGHT if i == 2 else 0.0, abs=1e-9)
+
+
+@given(number(3.2))
+@settings(max_examples=30)
+def test_compliance_acts_along_the_normal_alone(heading):
+    p = Params(contact_stiffness=0.5, contact_damping=0.7)
+    n, t = (cos(heading), sin(heading)), (-sin(heading), cos(heading))
+    _, along, _ = law(error=(0.1 * n[0], 0.1 * n[1], 0.0), heading=heading, contact=1.0, adapt=False, params=p)
+    assert along[0] * n[0] + along[1] * n[1] == pytest.approx(-MASS * 0.5 * 0.1)
+    _, across, _ = law(error=(0.1 * t[0], 0.1 * t[1], 0.0), heading=heading, contact=1.0, adapt=False, params=p)
+    assert across[0] * t[0] + across[1] * t[1] == pytest.approx(-MASS * (p.alpha * p.gamma + 1.0) * 0.1)
+
+
+def test_adaptation_rests_along_the_normal_at_the_pipe():
+    state, _, _ = law(error=(0.1, 0.2, 0.0), hold=True, params=Params(freeze_in_contact=True))
+    assert state.disturbance[0] == 0.0 and state.disturbance[1] < 0.0
+
+
+def test_the_desired_force_is_fed_forward_along_the_normal():
+    _, tau, _ = law(heading=0.5, contact=1.0, force=2.0, params=Params(feed_forward=1.0))
+    assert tau[0] == pytest.approx(2.0 * cos(0.5)) and tau[1] == pytest.approx(2.0 * sin(0.5))
+
+
+def test_turning_compliant_is_continuous():
+    """No jump at take-over: a small change of the blend changes the force a little."""
+    forces = [law(error=(0.05, 0.0, 0.0), contact=c / 100.0, force=0.2, params=Params())[1][0] for c in range(101)]
+    assert max(abs(a - b) for a, b in zip(forces, forces[1:], strict=False)) < 0.02
