@@ -28,7 +28,7 @@ sim: $(RUN)
 	@$(VENV)/bin/pipewright sim $(ARGS)
 
 # The last gate before the actuators is covered to the last branch, or the tests fail.
-GATE_TEST := tests/onboard/core/test_limits.py
+GATE_TEST := tests/core/test_limits.py
 
 test: $(DEV)
 	$(PY) -m pytest -n 2 --dist loadscope $(ARGS)
@@ -52,7 +52,7 @@ clean:
 $(PY):
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed and was not found. Install it (Debian, Ubuntu: \
 	apt install python3.11 python3.11-venv), or name it: make PYTHON=/path/to/python" >&2; exit 1; }
-	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "$(PYTHON) is not Python 3.11 or newer." >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "$(PYTHON) is no Python 3.11 or newer." >&2; exit 1; }
 	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { echo "$(PYTHON) cannot make virtual environments. Install its \
 	venv package (Debian, Ubuntu: apt install python3-venv)." >&2; exit 1; }
 	"$(PYTHON)" -m venv $(VENV)

@@ -238,7 +238,7 @@ def test_wrong_values_are_all_told_at_once_with_their_place(configs: Path) -> No
 
 def test_an_unknown_option_lists_the_nearest_parameters() -> None:
     assert "nearest: pipe.radius" in error_of("paper", "pipe.raduis=1")
-    assert "nearest: repair.force" in error_of("paper", "force=1")
+    assert "repair.force" in error_of("paper", "force=1")
     assert "nearest: vehicle.base.mass" in error_of("paper", "vehicle.base.mas=1")
     assert "nearest: vehicle.arm.parts.2.mass" in error_of("paper", "vehicle.arm.parts.2.mas=1")
 
