@@ -289,6 +289,8 @@ def test_a_type_that_yaml_cannot_hold_is_an_error_of_the_declaration() -> None:
 
     with pytest.raises(TypeError, match="cannot be of type"):
         load(Wrong, {"when": "x"}, "x")
+    with pytest.raises(TypeError, match="cannot be of type"):
+        describe(Wrong)
 
 
 # --- unknown keys -----------------------------------------------------------------------------------------------------
