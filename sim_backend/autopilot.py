@@ -1,12 +1,10 @@
-"""What an autopilot does around its inner loops: arming, modes, offboard loss, landing, and the delay of commands.
-
-Faces (the in-process mock, a stand-in that speaks MAVLink) call the verbs; the world calls ``update``.
-"""
+"""What an autopilot does around its inner loops: arming, modes, offboard loss, landing, and the delay of commands."""
 
 from __future__ import annotations
 
 from collections import deque
-from typing import Annotated
+from math import inf, isfinite
+from typing import Annotated, Protocol
 
 import numpy as np
 from msgspec import Struct
@@ -25,18 +23,12 @@ class AutopilotParams(Struct, frozen=True, forbid_unknown_fields=True):
 
     command_delay: Annotated[float, knob("s", "set-point to inner loop, attitude and body rate", 0.0, 0.2)] = 0.012
     wrench_delay: Annotated[float, knob("s", "set-point to mixer, wrench", 0.0, 0.2)] = 0.0
-    arm_delay: Annotated[
-        float, knob("s", "set-points must stream for this long before arming and offboard", 0.0, 5.0)
-    ] = 0.5
-    offboard_timeout: Annotated[float, knob("s", "COM_OF_LOSS_T: silence after which it lands by itself", 0.1, 5.0)] = (
-        0.5
-    )
+    arm_delay: Annotated[float, knob("s", "stream of set-points needed before arming and offboard", 0.0, 5.0)] = 0.5
+    offboard_timeout: Annotated[float, knob("s", "COM_OF_LOSS_T: silence after which it lands", 0.1, 5.0)] = 0.5
     descent_speed: Annotated[float, knob("m/s", "speed of its own landing", 0.1, 2.0)] = 0.5
     landed_time: Annotated[float, knob("s", "rest on the skids for this long counts as landed", 0.05, 5.0)] = 0.3
     landed_speed: Annotated[float, knob("m/s", "slower than this counts as rest", 0.01, 1.0)] = 0.1
-    disarm_delay: Annotated[
-        float, knob("s", "COM_DISARM_LAND: landed for this long after its own landing disarms", 0.0, 10.0)
-    ] = 1.0
+    disarm_delay: Annotated[float, knob("s", "COM_DISARM_LAND: from landed to disarmed in mode LAND", 0.0, 10.0)] = 1.0
 
 
 class SetPoint(Struct, frozen=True, gc=False):
@@ -44,12 +36,59 @@ class SetPoint(Struct, frozen=True, gc=False):
 
     interface: Interface
     thrust: float
-    torque_B: Vec3
-    q_WB: Quat
-    w_WB_B: Vec3
+    """N."""
+    torque_B: Vec3 = (0.0, 0.0, 0.0)
+    q_WB: Quat = (1.0, 0.0, 0.0, 0.0)
+    w_WB_B: Vec3 = (0.0, 0.0, 0.0)
+
+
+class Descent(Struct, frozen=True, gc=False):
+    """The autopilot flies by itself: no horizontal velocity, heading kept, down at ``speed`` m/s (0: hover)."""
+
+    speed: float
 
 
 _KINDS = {Interface.WRENCH: loops.WRENCH, Interface.ATTITUDE: loops.ATTITUDE, Interface.BODY_RATE: loops.BODY_RATE}
+
+
+def drive(u: Array, demand: SetPoint | Descent | None) -> None:
+    """Write into ``u`` what the inner loops shall follow; None stops the motors."""
+    if demand is None:
+        u[at.U_SETPOINT] = loops.NONE
+    elif isinstance(demand, Descent):
+        u[at.U_SETPOINT] = loops.VELOCITY
+        u[at.U_THRUST] = demand.speed
+    else:
+        u[at.U_SETPOINT] = _KINDS[demand.interface]
+        u[at.U_THRUST] = demand.thrust
+        u[at.U_BODY_TORQUE : at.U_BODY_TORQUE + 3] = demand.torque_B
+        u[at.U_ATTITUDE : at.U_ATTITUDE + 4] = demand.q_WB
+        u[at.U_BODY_RATE : at.U_BODY_RATE + 3] = demand.w_WB_B
+
+
+class Pilot(Protocol):
+    """What the world asks for the demand on its inner loops."""
+
+    def next_change(self) -> float:
+        """Simulated time at which the demand changes by itself, s; infinity when that is not known."""
+
+    def update(self, t: float, on_ground: bool, speed: float, u: Array) -> None:
+        """Bring the demand in ``u`` up to time ``t`` (s); ``speed`` (m/s) is the body's."""
+
+
+class Follower:
+    """A pilot without rules of its own: flies the demand that somebody else has decided."""
+
+    def __init__(self) -> None:
+        self.demand: SetPoint | Descent | None = None
+
+    def next_change(self) -> float:
+        """Not known."""
+        return inf
+
+    def update(self, t: float, on_ground: bool, speed: float, u: Array) -> None:
+        """Hand the demand on."""
+        drive(u, self.demand)
 
 
 class Autopilot:
@@ -64,31 +103,33 @@ class Autopilot:
         self._pending: deque[tuple[float, SetPoint]] = deque()
         self._setpoint: SetPoint | None = None
         self._stream_start = 0.0
-        self._stream_last: float | None = None
+        self._stream_last = -inf
         self._rest_since: float | None = 0.0
         self._landed_at = 0.0
 
-    def setpoint(self, t: float, setpoint: SetPoint) -> None:
-        """Take one set-point, received at ``t``; it reaches the loops after the interface's delay."""
-        params = self.params
-        if self._stream_last is None or t - self._stream_last > params.offboard_timeout:
+    def offer(self, t: float, setpoint: SetPoint) -> None:
+        """Take one set-point, received at ``t``; it reaches the loops after the interface's delay.
+
+        One that holds a number that is not finite is ignored, as PX4 does.
+        """
+        s, params = setpoint, self.params
+        if not isfinite(s.thrust + sum(s.torque_B) + sum(s.q_WB) + sum(s.w_WB_B)):
+            return
+        if t - self._stream_last > params.offboard_timeout:
             self._stream_start = t
         self._stream_last = t
-        delay = params.wrench_delay if setpoint.interface is Interface.WRENCH else params.command_delay
-        self._pending.append((t + delay, setpoint))
+        delay = params.wrench_delay if s.interface is Interface.WRENCH else params.command_delay
+        self._pending.append((t + delay, s))
 
     def streaming(self, t: float) -> bool:
-        """Set-points have come for long enough, and still come: arming and offboard would be accepted."""
-        last = self._stream_last
-        params = self.params
-        return last is not None and t - last <= params.offboard_timeout and t - self._stream_start >= params.arm_delay
+        """Set-points have come for long enough, and still come: arming and offboard are accepted."""
+        fresh = t - self._stream_last <= self.params.offboard_timeout
+        return fresh and t - self._stream_start >= self.params.arm_delay
 
     def arm(self) -> bool:
         """Arm; refused after a kill, until ``disarm`` on the ground has cleared it."""
-        if self.killed:
-            return False
-        self.armed = True
-        return True
+        self.armed = not self.killed
+        return self.armed
 
     def disarm(self) -> bool:
         """Disarm, and clear a kill; refused in the air."""
@@ -107,7 +148,7 @@ class Autopilot:
         return True
 
     def kill(self) -> None:
-        """Cut the motors at once."""
+        """Cut the motors at once, wherever the vehicle is."""
         self._stop()
         self.killed = True
 
@@ -115,50 +156,38 @@ class Autopilot:
         self.armed = False
         self._setpoint = None
         self._pending.clear()
-        self._stream_last = None
+        self._stream_last = -inf
 
     def next_change(self) -> float:
         """Time at which the next pending set-point falls due, s; infinity when none is pending."""
-        return self._pending[0][0] if self._pending else float("inf")
+        return self._pending[0][0] if self._pending else inf
 
     def update(self, t: float, on_ground: bool, speed: float, u: Array) -> None:
-        """Bring modes and the drive ``u`` up to time ``t``; ``speed`` (m/s) is the body's."""
+        """Land detector, failsafe, disarming after landing, and the set-point that is due at ``t``."""
         params = self.params
-        self._watch_landing(t, on_ground, speed)
-        silent = self._stream_last is None or t - self._stream_last > params.offboard_timeout
-        if self.armed and self.mode is FlightMode.OFFBOARD and silent:
+        self._detect_land(t, on_ground, speed)
+        if self.armed and self.mode is FlightMode.OFFBOARD and t - self._stream_last > params.offboard_timeout:
             self.mode = FlightMode.LAND
         landed = self.landed is Landed.ON_GROUND
         if self.armed and self.mode is FlightMode.LAND and landed and t - self._landed_at >= params.disarm_delay:
             self._stop()
         while self._pending and self._pending[0][0] <= t + 1e-9:
             self._setpoint = self._pending.popleft()[1]
-        self._drive(u)
+        if not self.armed:
+            drive(u, None)
+        elif self.mode is FlightMode.OFFBOARD:
+            drive(u, self._setpoint)
+        else:
+            drive(u, Descent(params.descent_speed if self.mode is FlightMode.LAND else 0.0))
 
-    def _watch_landing(self, t: float, on_ground: bool, speed: float) -> None:
+    def _detect_land(self, t: float, on_ground: bool, speed: float) -> None:
+        if not on_ground:
+            self.landed = Landed.IN_AIR
         if not on_ground or speed > self.params.landed_speed:
             self._rest_since = None
-            if not on_ground:
-                self.landed = Landed.IN_AIR
             return
         if self._rest_since is None:
             self._rest_since = t
         if self.landed is not Landed.ON_GROUND and t - self._rest_since >= self.params.landed_time:
             self.landed = Landed.ON_GROUND
             self._landed_at = t
-
-    def _drive(self, u: Array) -> None:
-        setpoint = self._setpoint
-        if not self.armed:
-            u[at.U_SETPOINT] = loops.NONE
-        elif self.mode is not FlightMode.OFFBOARD:
-            u[at.U_SETPOINT] = loops.VELOCITY
-            u[at.U_THRUST] = self.params.descent_speed if self.mode is FlightMode.LAND else 0.0
-        elif setpoint is None:
-            u[at.U_SETPOINT] = loops.NONE
-        else:
-            u[at.U_SETPOINT] = _KINDS[setpoint.interface]
-            u[at.U_THRUST] = setpoint.thrust
-            u[at.U_BODY_TORQUE : at.U_BODY_TORQUE + 3] = setpoint.torque_B
-            u[at.U_ATTITUDE : at.U_ATTITUDE + 4] = setpoint.q_WB
-            u[at.U_BODY_RATE : at.U_BODY_RATE + 3] = setpoint.w_WB_B

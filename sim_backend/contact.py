@@ -16,6 +16,9 @@ from sim_backend.knob import knob
 Array = NDArray[np.float64]
 Three = tuple[float, float, float]
 
+#: The first of the points that the ground can touch belong to the airframe: a hard hit of one breaks the vehicle.
+FRAME_POINTS = 8
+
 #: Modes of a bristle.
 FREE, STICK, SLIDE = 0.0, 1.0, 2.0
 
@@ -29,9 +32,7 @@ class ContactParams(Struct, frozen=True, forbid_unknown_fields=True):
     friction_kinetic: Annotated[float, knob("1", "dynamic friction coefficient", 0.0, 3.0)] = 0.9
     tangential_stiffness: Annotated[float, knob("N/m", "stiffness of the sticking contact", 1e2, 1e6)] = 20e3
     tangential_damping: Annotated[float, knob("N s/m", "damping of the sticking contact", 0.0, 1e3)] = 40.0
-    release_angle: Annotated[float, knob("rad", "gripper servo angle beyond which the sleeve is let go", 0.05, 3.0)] = (
-        0.5
-    )
+    release_angle: Annotated[float, knob("rad", "gripper angle beyond which the sleeve is let go", 0.05, 3.0)] = 0.8
 
 
 class GroundParams(Struct, frozen=True, forbid_unknown_fields=True):
@@ -157,7 +158,7 @@ def ground_point(x: Array, p: Array, index: int, height: float, velocity: Three)
         x[row + 1] = 0.0
         x[row + 2] = 0.0
         return 0.0, 0.0, 0.0
-    if x[row] == FREE and -velocity[2] > p[at.GROUND_CRASH_SPEED] and x[at.CRASH] == 0.0:
+    if index < FRAME_POINTS and x[row] == FREE and -velocity[2] > p[at.GROUND_CRASH_SPEED] and x[at.CRASH] == 0.0:
         x[at.CRASH] = 1.0
         x[at.CRASH_VALUE] = -velocity[2]
     normal = max(0.0, -p[at.GROUND_STIFFNESS] * height - p[at.GROUND_DAMPING] * velocity[2])

@@ -38,7 +38,8 @@ PHASE = 62  # physics steps since the inner loops ran
 ROTOR_LIMIT = 63  # N, what the battery's voltage lets one rotor give
 TIP = 64  # 3, gripper tip, m, W
 NEEDLE_TIP = 67  # 3, m, W
-GROUND_BRISTLE = 70  # GROUND_POINTS x (mode, stretch x, stretch y)
+TOOL_SERVO_RATE = 70  # 2, pump and gripper, rad/s
+GROUND_BRISTLE = 72  # GROUND_POINTS x (mode, stretch x, stretch y)
 GROUND_POINTS = 12  # 4 skids, 4 rotor hubs, elbow, wrist, gripper tip, needle tip
 STATE_SIZE = GROUND_BRISTLE + 3 * GROUND_POINTS
 

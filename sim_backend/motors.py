@@ -1,4 +1,7 @@
-"""Rotors and battery: the X500's layout, the thrust curve, and what the battery gives."""
+"""Rotors and battery: the X500's layout, thrust lag, and what the battery gives.
+
+The curve from PX4's 0..1 to newtons is ``drivers.thrust``; here thrust is in newtons.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from math import exp, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.vehicle import Battery, Rotors
+from drivers.vehicle import Battery
 from sim_backend import layout as at
 from sim_backend.compiled import compiled
 
@@ -17,29 +20,8 @@ Four = tuple[float, float, float, float]
 
 
 def rated_voltage(battery: Battery) -> float:
-    """Voltage at which ``Rotors.max_thrust`` holds: half way between full and empty, V."""
+    """Voltage at which ``Rotors.max_thrust`` holds, V: half way between full and empty (as ``drivers.thrust``)."""
     return 0.5 * (battery.full_voltage + battery.empty_voltage)
-
-
-def thrust_of_throttle(throttle: float, voltage: float, rotors: Rotors, battery: Battery) -> float:
-    """Thrust of one rotor, N, for a normalised throttle 0..1 at a battery voltage, V.
-
-    PX4's THR_MDL_FAC curve f u^2 + (1 - f) u; the full thrust goes with the square of the voltage, since the
-    propeller's speed goes with the voltage.
-    """
-    u = min(1.0, max(0.0, throttle))
-    share = rotors.curve * u * u + (1.0 - rotors.curve) * u
-    return rotors.max_thrust * (voltage / rated_voltage(battery)) ** 2 * share
-
-
-def throttle_of_thrust(thrust: float, voltage: float, rotors: Rotors, battery: Battery) -> float:
-    """Inverse of ``thrust_of_throttle``; 1 when the thrust is more than the rotor can give at this voltage."""
-    full = rotors.max_thrust * (voltage / rated_voltage(battery)) ** 2
-    share = min(1.0, max(0.0, thrust / full))
-    f = rotors.curve
-    if f == 0.0:
-        return share
-    return (sqrt((1.0 - f) ** 2 + 4.0 * f * share) - (1.0 - f)) / (2.0 * f)
 
 
 def lag_gain(step: float, time_constant: float) -> float:

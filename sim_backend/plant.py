@@ -67,6 +67,8 @@ class Truth(Struct, frozen=True, gc=False):
     battery_remaining: float
     crashed: str
     """Empty, or what happened to the vehicle ("hit the ground at 3.2 m/s", "propeller struck the pipe")."""
+    payload: bool = True
+    """The sleeve is in the gripper; neither here nor on the pipe, it was dropped."""
 
 
 class Plant(Protocol):

@@ -390,7 +390,7 @@ class RigidBody:
         self.x = np.zeros(at.STATE_SIZE)
         self.u = np.zeros(at.DRIVE_SIZE)
         self.steps = 0
-        self._last_steps = 0
+        self.last_steps = 0
         self._start()
 
     def _start(self) -> None:
@@ -409,7 +409,7 @@ class RigidBody:
         x[at.POSITION : at.POSITION + 2] = 0.0
         x[at.CHARGE] = 1.0
         x[at.TIP_SLIP] = 0.0
-        self._last_steps = round(SETTLING_TIME / self.params.step)
+        self.last_steps = round(SETTLING_TIME / self.params.step)
 
     @property
     def time(self) -> float:
@@ -442,11 +442,11 @@ class RigidBody:
         if not isfinite(self.x[at.POSITION] + self.x[at.JOINT]):
             raise FloatingPointError(f"the world's state is not finite any more at {self.time:.4f} s")
         self.steps += steps
-        self._last_steps = steps
+        self.last_steps = steps
 
     def truth(self) -> Truth:
         """What is true now."""
-        return truth_of(self.x.tolist(), self.time, self._last_steps)
+        return truth_of(self.x.tolist(), self.time, self.last_steps)
 
 
 #: Time the vehicle is given to settle on its skids before the start, s.
@@ -490,4 +490,5 @@ def truth_of(x: list[float], t: float, steps: int) -> Truth:
         battery_voltage=x[at.VOLTAGE],
         battery_remaining=x[at.CHARGE],
         crashed=CRASHES[int(x[at.CRASH])].format(x[at.CRASH_VALUE]),
+        payload=x[at.PAYLOAD] != 0.0,
     )

@@ -58,9 +58,9 @@ def stop_torque(p: Array, k: int, angle: float, rate: float) -> float:
 @compiled()
 def tool_servos(x: Array, p: Array, u: Array) -> None:
     """Advance pump and gripper by one step: first-order towards the goal, no faster than the no-load speed."""
-    if u[at.U_TORQUE_ON] == 0.0:
-        return
-    most = p[at.NO_LOAD_SPEED] * p[at.STEP]
+    most = p[at.NO_LOAD_SPEED] * p[at.STEP] if u[at.U_TORQUE_ON] != 0.0 else 0.0
     for k in range(2):
         move = p[at.TOOL_SERVO_GAIN] * (u[at.U_GOAL + 3 + k] - x[at.PUMP + k])
-        x[at.PUMP + k] += min(max(move, -most), most)
+        move = min(max(move, -most), most)
+        x[at.PUMP + k] += move
+        x[at.TOOL_SERVO_RATE + k] = move / p[at.STEP]

@@ -1,4 +1,4 @@
-"""One simulated world: the rigid-body plant, the autopilot around it, the servo bus, and its clock."""
+"""One simulated world: the rigid-body plant, the autopilot around it, the servo bus, the sensors, and its clock."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 from drivers.samples import JointMode, ServoCommand, Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
-from sim_backend.autopilot import Autopilot, AutopilotParams
+from sim_backend.autopilot import Autopilot, AutopilotParams, Pilot
 from sim_backend.compiled import compiled
 from sim_backend.inner_loops import LoopParams, inner_loops, put_loops
 from sim_backend.plant import Truth
 from sim_backend.rigid_body import PlantParams, RigidBody, physics, truth_of
+from sim_backend.sensors import SensorParams, Sensors, Snapshot
 
 Array = NDArray[np.float64]
+
+#: The pilot is asked no less often than this, s.
+PILOT_PERIOD = 0.02
 
 
 class WorldParams(Struct, frozen=True, forbid_unknown_fields=True):
@@ -26,6 +30,7 @@ class WorldParams(Struct, frozen=True, forbid_unknown_fields=True):
     plant: PlantParams = PlantParams()
     loops: LoopParams = LoopParams()
     autopilot: AutopilotParams = AutopilotParams()
+    sensors: SensorParams = SensorParams()
 
 
 @compiled("(f8[::1], f8[::1], f8[::1], i8)")
@@ -45,10 +50,13 @@ def _fly(x: Array, p: Array, u: Array, steps: int) -> None:
 
 
 class World:
-    """A vehicle, a pipe, and time. Deterministic: same calls, same bits.
+    """A vehicle, a pipe, and time. Deterministic: same seed and calls, same bits.
 
     ``pipe_position`` (m, W) is a point of the pipe's axis, ``pipe_heading`` (rad) the horizontal direction in which
-    the vehicle presses (the axis is square to it), ``pipe_radius`` in m. The vehicle starts standing at the origin.
+    the vehicle presses (the axis is square to it), ``pipe_radius`` in m. The vehicle starts at rest on the ground at
+    the origin, disarmed, the sleeve in the gripper, the arm folded and held by its servos until they are commanded.
+
+    One thread advances the world; others may read ``snapshot`` and ``truth`` and command the servos meanwhile.
     """
 
     def __init__(
@@ -65,79 +73,67 @@ class World:
         self.plant = RigidBody(vehicle, params.plant, pipe_position, pipe_heading, pipe_radius)
         put_loops(self.plant.p, vehicle, params.loops, params.plant.start_joints, params.plant.step)
         self.autopilot = Autopilot(params.autopilot)
+        #: Who decides what the inner loops follow; a stand-in for a real autopilot puts itself here.
+        self.pilot: Pilot = self.autopilot
+        self.sensors = Sensors(params.sensors, vehicle, seed)
         self._servo_command: ServoCommand | None = None
-        self._state: list[float] = self.plant.x.tolist()
-        self._last_steps = 1
-        self._truth: Truth | None = None
+        self.snapshot = self._look(self.plant.x.tolist(), self.plant.last_steps)
+        self.sensors.observe(self.snapshot)
 
     @property
     def time(self) -> float:
         """Simulated time, s."""
         return self.plant.time
 
-    @property
-    def t_ns(self) -> int:
-        """Simulated time, ns."""
-        return round(self.plant.time * 1e9)
-
-    @property
-    def state(self) -> list[float]:
-        """The plant's state after the last advance, in the order of ``layout``."""
-        return self._state
-
-    @property
-    def last_steps(self) -> int:
-        """Length of the last advance in physics steps."""
-        return self._last_steps
-
     def truth(self) -> Truth:
         """What is true after the last advance."""
-        if self._truth is None:
-            self._truth = truth_of(self._state, self.time, self._last_steps)
-        return self._truth
+        now = self.snapshot
+        return truth_of(now.x, now.t_ns * 1e-9, now.steps)
 
     def command_servos(self, command: ServoCommand) -> None:
-        """Set the goals of the five servos, from the next advance on."""
-        self._servo_command = command
+        """Set the goals of the five servos, from the next advance on; one that is not finite is ignored."""
+        if isfinite(sum(command.torque) + sum(command.position) + command.current_limit):
+            self._servo_command = command
 
     def advance(self, duration: float) -> None:
         """Advance by ``duration`` seconds, a whole number of physics steps (else ValueError)."""
         plant = self.plant
         x, u, step = plant.x, plant.u, plant.params.step
         left = total = plant.steps_of(duration)
+        longest = ceil(PILOT_PERIOD / step)
         x[at.CONTACT_PEAK] = 0.0
         x[at.SPECIFIC_FORCE_SUM : at.SPECIFIC_FORCE_SUM + 3] = 0.0
         command, self._servo_command = self._servo_command, None
         if command is not None:
-            self._drive_servos(command, u)
-        state = self._state
-        longest = ceil(MODE_PERIOD / step)
+            u[at.U_TORQUE_ON] = command.mode is not JointMode.OFF
+            u[at.U_POSITION_MODE] = command.mode is JointMode.POSITION
+            u[at.U_TORQUE : at.U_TORQUE + 3] = command.torque
+            u[at.U_GOAL : at.U_GOAL + 5] = command.position
+            u[at.U_CURRENT_LIMIT] = command.current_limit
+        state = self.snapshot.x
         while left:
+            t = plant.time
             speed = hypot(state[at.VELOCITY], state[at.VELOCITY + 1], state[at.VELOCITY + 2])
-            self.autopilot.update(plant.time, state[at.ON_GROUND] != 0.0, speed, u)
-            change = self.autopilot.next_change() - plant.time
-            until = ceil(change / step - 1e-6) if isfinite(change) else left
-            count = min(left, longest, max(1, until))
+            self.pilot.update(t, state[at.ON_GROUND] != 0.0, speed, u)
+            until = (self.pilot.next_change() - t) / step
+            count = min(left, longest)
+            if until < count:
+                count = max(1, ceil(until - 1e-6))
             _fly(x, plant.p, u, count)
             plant.count(count)
             left -= count
             state = x.tolist()
-        self._last_steps = total
-        self._state = state
-        self._truth = None
+        self.snapshot = self._look(state, total)
+        self.sensors.observe(self.snapshot)
 
-    def _drive_servos(self, command: ServoCommand, u: Array) -> None:
-        u[at.U_TORQUE_ON] = command.mode is not JointMode.OFF
-        u[at.U_POSITION_MODE] = command.mode is JointMode.POSITION
-        u[at.U_TORQUE : at.U_TORQUE + 3] = command.torque
-        u[at.U_GOAL : at.U_GOAL + 5] = command.position
-        u[at.U_CURRENT_LIMIT] = command.current_limit
-
-    @property
-    def servo_torque_on(self) -> bool:
-        """Torque is enabled on the servo bus."""
-        return bool(self.plant.u[at.U_TORQUE_ON] != 0.0)
-
-
-#: The autopilot's modes are looked at no less often than this, s.
-MODE_PERIOD = 0.02
+    def _look(self, x: list[float], steps: int) -> Snapshot:
+        autopilot = self.autopilot
+        return Snapshot(
+            round(self.plant.time * 1e9),
+            x,
+            steps,
+            autopilot.armed,
+            autopilot.mode,
+            autopilot.landed,
+            bool(self.plant.u[at.U_TORQUE_ON] != 0.0),
+        )
