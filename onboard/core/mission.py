@@ -250,6 +250,11 @@ def can_hover(state: State, facts: Facts, params: Params) -> bool:
     return facts.airborne and not state.autoland and not state.yielded
 
 
+def can_hover_touching(state: State, facts: Facts, params: Params) -> bool:
+    """In the air, the core in command, the tool in contact."""
+    return facts.in_contact and can_hover(state, facts, params)
+
+
 def hover_only(state: State, facts: Facts, params: Params) -> bool:
     """Hovering after a takeoff that was all that was asked for."""
     return state.mode == "takeoff" and state.resume_phase is None
@@ -360,10 +365,11 @@ TABLE: Final[tuple[Row, ...]] = (
 
     # Hold.
     Row((P.TAKEOFF,), _HOLD, standing, P.LAND, "takeoff_aborted"),
-    Row(FREE, _HOLD, touching, P.RETREAT_HOLD, "retreat_hold"),
+    Row((*FREE, P.HOLD), _HOLD, touching, P.RETREAT_HOLD, "retreat_hold"),
     Row(FREE, _HOLD, always, P.HOLD, "hold"),
     Row(CONTACT, _HOLD, always, P.RETREAT_HOLD, "retreat_hold"),
     Row((P.RETREAT_LAND,), (R.HOLD,), can_hover, P.RETREAT_HOLD, "retreat_hold"),
+    Row((P.LAND,), (R.HOLD,), can_hover_touching, P.RETREAT_HOLD, "retreat_hold"),
     Row((P.LAND,), (R.HOLD,), can_hover, P.HOLD, "hold"),
     Row((P.LAND, P.RETREAT_LAND), (R.HOLD,), always, None, "refused_hold"),
     Row((P.RETREAT_HOLD,), (R.HOLD,), giving_up, P.RETREAT_HOLD, "retreat_hold"),
