@@ -67,22 +67,22 @@ def step(
     jump, reset, disagreement = 0.0, False, state.disagreement
     odometry, autopilot, servos = state.odometry, state.autopilot, state.servos
     new = inputs.odometry
-    if new is not None and new is not odometry:
+    if new is not None and (odometry is None or new.t_ns != odometry.t_ns):
         if _finite(new.p_WB, new.v_WB, new.q_WB):
-            if odometry is not None and new.t_ns != odometry.t_ns:
+            if odometry is not None:
                 jump = _jump(odometry, new)
                 reset = new.reset_counter != odometry.reset_counter
             odometry = new
         else:
             finite = False
     told = inputs.autopilot
-    if told is not None and told is not autopilot:
+    if told is not None:
         if _finite(told.q_WB, told.w_WB_B, told.f_B):
             autopilot = told
         else:
             finite = False
     bus = inputs.servos
-    if bus is not None and bus is not servos:
+    if bus is not None:
         if _finite(bus.position, bus.velocity, bus.current):
             servos = bus
         else:
@@ -144,7 +144,7 @@ def step(
         math3.rotate_transposed(kinematics.tool_rotation(joints[2]), math3.rotate_transposed(R, force)),
         compression, trigger.contact, payload, ages[0], ages[1], ages[2], True,
     )  # fmt: skip
-    if odometry is not state.odometry:
+    if state.odometry is None or odometry.t_ns != state.odometry.t_ns:
         x, y, z = math3.vertical(odometry.q_WB)
         disagreement = acos(min(1.0, max(-1.0, x * R[6] + y * R[7] + z * R[8])))
     return State(odometry, autopilot, servos, watched, trigger, payload, finite, jump, reset, disagreement), estimate

@@ -38,7 +38,7 @@ Says = tuple[str, Severity, str]
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
     """How long each phase may take, and how often contact may be lost."""
 
-    preflight_timeout: Annotated[float, spec("s", 1.0, 86400.0, "wait for a start, then STOPPED")] = 3600.0
+    preflight_timeout: Annotated[float, spec("s", 1.0, 86400.0, "without a start, then STOPPED")] = 3600.0
     takeoff_timeout: Annotated[float, spec("s", 1.0, 600.0, "then LAND")] = 30.0
     approach_timeout: Annotated[float, spec("s", 1.0, 600.0, "then HOLD")] = 120.0
     align_timeout: Annotated[float, spec("s", 1.0, 600.0, "then HOLD")] = 60.0

@@ -1,0 +1,5 @@
+"""``python -m onboard``."""
+
+from onboard.main import main
+
+raise SystemExit(main())

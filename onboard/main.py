@@ -1,0 +1,128 @@
+"""``python -m onboard``: the flight process, started as a person or the ground station would.
+
+Exit codes: 0 the run ended by itself and its log is complete, 2 wrong input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from onboard.config import Config, dump_config, load_config
+from onboard.core.plan import Infeasible
+from onboard.core.types import Outputs, Phase
+from onboard.layers import ConfigError
+
+WRONG_INPUT = 2
+#: Phases of a mission in order, for the progress bar.
+CHAIN = (
+    Phase.PREFLIGHT, Phase.TAKEOFF, Phase.APPROACH, Phase.ALIGN, Phase.ADHESIVE, Phase.TOOL_CHANGE, Phase.TARE,
+    Phase.ADVANCE, Phase.PRESS, Phase.RELEASE, Phase.RETREAT, Phase.RETURN, Phase.LAND, Phase.STOPPED,
+)  # fmt: skip
+
+
+class Progress:
+    """A bar over the phases of the mission, with the phase, the simulated time and the speed."""
+
+    def __init__(self, shown: bool) -> None:
+        self._bar: Any = None
+        self._last: Phase | None = None
+        if shown:
+            from tqdm import tqdm
+
+            self._bar = tqdm(
+                total=len(CHAIN) - 1,
+                bar_format="{desc:<12} |{bar:30}| {postfix[0]:7.1f} s simulated, {elapsed} elapsed",
+                postfix=[0.0],
+                leave=False,
+            )
+        self._count = 0
+
+    def __call__(self, outputs: Outputs, t: float) -> None:
+        """Show one tick; redraws a few times a simulated second."""
+        if self._bar is None:
+            return
+        self._count += 1
+        if outputs.phase is not self._last:
+            self._last = outputs.phase
+            self._bar.set_description_str(outputs.phase.value, refresh=False)
+            if outputs.phase in CHAIN:
+                self._bar.n = CHAIN.index(outputs.phase)
+        elif self._count % 250:
+            return
+        self._bar.postfix[0] = t
+        self._bar.refresh()
+
+    def close(self) -> None:
+        """Take the bar away."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        if options.command == "sim":
+            return _sim(options)
+        return _replay(options)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+    except Infeasible as error:
+        print(f"this mission cannot be flown: {error}", file=sys.stderr)
+    return WRONG_INPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m onboard", description=__doc__.split("\n")[0] if __doc__ else "")
+    commands = parser.add_subparsers(dest="command", required=True)
+    sim = commands.add_parser("sim", help="fly the mission in a simulated world, in virtual time")
+    sim.add_argument("--scenario", default="paper")
+    sim.add_argument("--law")
+    sim.add_argument("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE")
+    sim.add_argument("--seed", type=int)
+    sim.add_argument("--out", type=Path, required=True, help="an existing or new run folder")
+    sim.add_argument("--no-progress", action="store_true")
+    replay = commands.add_parser("replay", help="run a log's inputs through the core again and compare to the bit")
+    replay.add_argument("log", type=Path)
+    replay.add_argument("--from", type=float, dest="start", metavar="SECONDS")
+    return parser
+
+
+def _prepare(config: Config, out: Path) -> Path:
+    """The path of the log in a fresh run folder. Checks the mission before anything is written."""
+    from onboard.core.derived import derive
+
+    derive(config)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "config.yaml").write_text(dump_config(config))
+    return out / "log.mcap"
+
+
+def _sim(options: argparse.Namespace) -> int:
+    from onboard.simulate import simulate
+
+    config = load_config(options.scenario, options.law, options.sets, options.seed)
+    log = _prepare(config, options.out)
+    progress = Progress(not options.no_progress and sys.stderr.isatty())
+    try:
+        simulate(config, log, progress)
+    finally:
+        progress.close()
+    return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from onboard.logfile import LogError
+    from onboard.replay import replay
+
+    try:
+        result = replay(options.log, options.start)
+    except LogError as error:
+        print(error, file=sys.stderr)
+        return WRONG_INPUT
+    print(result)
+    return 0 if result.same else 1

@@ -1,0 +1,70 @@
+"""The desk mission in virtual time: world, mock devices, loop and recorder in one process."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+from onboard.clock import VirtualClock
+from onboard.config import Config, dump_config
+from onboard.core.step import State
+from onboard.core.types import Outputs, Phase, Request, Tick
+from onboard.devices import mock_devices, world_of
+from onboard.loop import Loop
+from onboard.recorder import Recorder
+from onboard.records import RunInfo, Timing
+from onboard.version import version
+from sim_backend.world import World
+
+#: Rest on the ground before the start is asked for, s.
+START_AT = 0.4
+#: A mission that has not ended by then is broken off, s of simulated time.
+LONGEST = 900.0
+
+
+class TruthSink:
+    """Records each tick together with what is true in the world at that moment."""
+
+    def __init__(self, recorder: Recorder, world: World) -> None:
+        self._recorder, self._world = recorder, world
+
+    def tick(self, tick: Tick) -> None:
+        """Take one cycle."""
+        self._recorder.tick(tick, self._world.truth())
+
+    def keyframe(self, index: int, t_ns: int, state: State) -> None:
+        """Take the core's state just before the tick of this index."""
+        self._recorder.keyframe(index, t_ns, state)
+
+    def timing(self, timing: Timing) -> None:
+        """Take the punctuality of one tick."""
+        self._recorder.timing(timing)
+
+
+def run_info(config: Config, *, realtime: bool = False, started: str = "") -> RunInfo:
+    """What the log says of the run."""
+    return RunInfo(version(), config.scenario, config.law, config.seed, realtime, started)
+
+
+def simulate(config: Config, log: Path, watch: Callable[[Outputs, float], None] | None = None) -> None:
+    """Fly the whole mission of ``config`` and record it to ``log``; ``watch`` sees outputs and time (s) of each tick.
+
+    Ends when the mission has stopped, when the vehicle is lost, or after ``LONGEST``.
+    """
+    world = world_of(config)
+    clock = VirtualClock(world.advance)
+    with Recorder(log, run_info(config), config, dump_config(config)) as recorder:
+        loop = Loop(mock_devices(world), clock, config, TruthSink(recorder, world))
+
+        def on_tick(outputs: Outputs) -> bool:
+            t = clock.now_ns() * 1e-9
+            if watch is not None:
+                watch(outputs, t)
+            if outputs.phase is Phase.PREFLIGHT and t >= START_AT and not asked:
+                asked.append(t)
+                loop.request(Request.START)
+            return outputs.phase is not Phase.STOPPED and not world.truth().crashed and t < LONGEST
+
+        asked: list[float] = []
+        asyncio.run(loop.run(on_tick))
