@@ -34,11 +34,20 @@ class ThrustMap(Struct, frozen=True, forbid_unknown_fields=True):
 
     @staticmethod
     def of(vehicle: Vehicle) -> ThrustMap:
-        """The map that the vehicle's data imply, hovering with the sleeve, and PX4's curve set to the motors'."""
+        """The map that the vehicle's data imply: hovering with the sleeve, PX4's curve set to the motors'.
+
+        Rotors give their full thrust half way between a full and an empty battery, and as the voltage squared.
+        """
         mass = vehicle.base.mass + sum(part.mass for part in vehicle.arm.parts) + vehicle.arm.sleeve.mass
-        force = mass * vehicle.gravity
-        curve = vehicle.rotors.curve
-        return ThrustMap(force, force / (4.0 * vehicle.rotors.max_thrust), vehicle.battery.full_voltage, curve, curve)
+        force, curve = mass * vehicle.gravity, vehicle.rotors.curve
+        return ThrustMap(
+            hover_force=force,
+            hover_thrust=force / (4.0 * vehicle.rotors.max_thrust),
+            hover_voltage=0.5 * (vehicle.battery.full_voltage + vehicle.battery.empty_voltage),
+            curve=curve,
+            px4_curve=curve,
+            voltage_exponent=2.0,
+        )
 
     def full_force(self, voltage: float) -> float:
         """Thrust at set-point 1, N, at a battery voltage in V (not positive or not finite: unknown, no correction)."""

@@ -17,7 +17,7 @@ vector = st.tuples(number, number, number)
 
 
 def rotate(q: Quat, v: Vec3) -> Vec3:
-    """v turned by q, by the sandwich product written out."""
+    """Turn v by q: the sandwich product written out."""
     w, x, y, z = q
     a, b, c = v
     tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)

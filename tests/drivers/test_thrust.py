@@ -15,13 +15,14 @@ from drivers.vehicle import Vehicle
 VEHICLE = msgspec.yaml.decode((Path(__file__).parents[2] / "configs" / "vehicle.yaml").read_bytes(), type=Vehicle)
 
 
-def test_map_of_the_vehicle_is_linear_up_to_four_rotors() -> None:
-    """PX4 undoes the motors' curve, so a set-point is the fraction of 4 x 13 N."""
+def test_map_of_the_vehicle() -> None:
+    """PX4 undoes the motors' curve, so at half battery (15 V) a set-point is the fraction of 4 x 13 N."""
     thrust = ThrustMap.of(VEHICLE)
-    assert thrust.full_force(16.0) == pytest.approx(52.0)
-    assert thrust.set_point(26.0, 16.0) == pytest.approx(0.5)
-    assert thrust.set_point(thrust.hover_force, 16.0) == pytest.approx(thrust.hover_thrust)
     assert thrust.hover_force == pytest.approx(2.4 * 9.80665)
+    assert thrust.full_force(15.0) == pytest.approx(52.0)
+    assert thrust.set_point(26.0, 15.0) == pytest.approx(0.5)
+    assert thrust.set_point(thrust.hover_force, 15.0) == pytest.approx(thrust.hover_thrust)
+    assert thrust.full_force(16.5) == pytest.approx(52.0 * 1.21)
 
 
 def test_curves_that_differ() -> None:
@@ -59,7 +60,11 @@ curve = st.floats(0.0, 1.0)
 
 @settings(deadline=None, max_examples=100, derandomize=True)
 @given(
-    hover=st.floats(0.1, 0.9), curve=curve, px4_curve=curve, set_point=st.floats(0.01, 0.99), voltage=st.floats(13.0, 17.0)
+    hover=st.floats(0.1, 0.9),
+    curve=curve,
+    px4_curve=curve,
+    set_point=st.floats(0.01, 0.99),
+    voltage=st.floats(13.0, 17.0),
 )
 def test_round_trip(hover: float, curve: float, px4_curve: float, set_point: float, voltage: float) -> None:
     thrust = ThrustMap(20.0, hover, 16.0, curve, px4_curve, 2.0)
