@@ -5,7 +5,8 @@ demanded then on the ground, in free flight and in contact, and how it clears. T
 bounds, in docs/safety.md.
 
 - Predicates say ``value <= bound``, so that a NaN violates them; every float is also checked for being finite, at
-  once. The two conditions that cut the motors are the exception: a NaN alone never does that.
+  once. The two conditions that cut the motors are the exception: what is not finite never does that. A sample
+  from the future is as bad as an old one: its age would never tell.
 - The ground are the phases PREFLIGHT and STOPPED: nothing is demanded there beyond a warning (preflight itself
   refuses to start), but for a tipped vehicle with its motors armed. In contact is where contact is expected.
 - Without position or attitude the core cannot fly: such conditions demand LAND, and ``blind`` tells the mission to
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from enum import StrEnum
+from math import inf
 from types import MappingProxyType
 from typing import Annotated, Final, NamedTuple
 
@@ -113,7 +115,7 @@ class Facts(Struct, frozen=True, gc=False):
     age_odometry: float
     age_autopilot: float
     age_servos: float
-    """Ages of the samples, s; infinity before the first."""
+    """Ages of the samples, s; infinity before the first, negative in the future."""
     odometry_jump: float
     """Displacement between the last two samples beyond the possible motion, m; 0 when there is no new sample."""
     odometry_reset: bool
@@ -237,8 +239,8 @@ TABLE: Final[tuple[Condition, ...]] = (
     Condition("non_finite", lambda f, p: _finite(f), None, WARNS, WELL),
     Condition("non_finite_sustained", lambda f, p: _finite(f), "non_finite_time", LANDS, LATCHED),
 
-    Condition("odometry_late", lambda f, p: f.age_odometry <= p.odometry_late, None, HOLDS, WELL),
-    Condition("odometry_lost", lambda f, p: f.age_odometry <= p.odometry_lost, None, LANDS, LATCHED),
+    Condition("odometry_late", lambda f, p: abs(f.age_odometry) <= p.odometry_late, None, HOLDS, WELL),
+    Condition("odometry_lost", lambda f, p: abs(f.age_odometry) <= p.odometry_lost, None, LANDS, LATCHED),
     Condition("odometry_jump", lambda f, p: f.odometry_jump <= p.odometry_jump, None, HOLDS, WELL),
     Condition("odometry_wild", lambda f, p: f.odometry_jump <= p.odometry_wild, None, LANDS, LATCHED),
     Condition("odometry_reset", lambda f, p: not f.odometry_reset, None, HOLDS, WELL),
@@ -250,15 +252,15 @@ TABLE: Final[tuple[Condition, ...]] = (
               lambda f, p: not f.airborne or f.disagreement <= p.disagreement,
               "disagreement_time", LANDS, LATCHED),
 
-    Condition("autopilot_late", lambda f, p: f.age_autopilot <= p.autopilot_late, None, HOLDS, WELL),
-    Condition("autopilot_lost", lambda f, p: f.age_autopilot <= p.autopilot_lost, None, LANDS, LATCHED),
+    Condition("autopilot_late", lambda f, p: abs(f.age_autopilot) <= p.autopilot_late, None, HOLDS, WELL),
+    Condition("autopilot_lost", lambda f, p: abs(f.age_autopilot) <= p.autopilot_lost, None, LANDS, LATCHED),
     Condition("offboard_lost", lambda f, p: not (f.offboard_lost and f.airborne), "offboard_lost_time", LANDS, LATCHED),
     Condition("disarmed",
               lambda f, p: f.armed or not f.airborne or f.phase is Phase.LAND,
               "disarmed_time", CUTS, LATCHED),
 
-    Condition("servos_late", lambda f, p: f.age_servos <= p.servos_late, None, WARNS, WELL),
-    Condition("servos_lost", lambda f, p: f.age_servos <= p.servos_lost, None, HOLDS, LATCHED),
+    Condition("servos_late", lambda f, p: abs(f.age_servos) <= p.servos_late, None, WARNS, WELL),
+    Condition("servos_lost", lambda f, p: abs(f.age_servos) <= p.servos_lost, None, HOLDS, LATCHED),
     Condition("servo_error", lambda f, p: f.servo_error == 0, "servo_error_time", HOLDS, LATCHED),
     Condition("servo_torque", lambda f, p: f.torque_on or not f.airborne, "torque_off_time", HOLDS, LATCHED),
     Condition("servo_warm", lambda f, p: f.temperature <= p.temperature_warm, "temperature_time", WARNS, WELL),
@@ -271,7 +273,7 @@ TABLE: Final[tuple[Condition, ...]] = (
               "joint_error_time", HOLDS, WELL),
 
     Condition("tilt", lambda f, p: not f.airborne or f.tilt <= p.tilt, "tilt_time", HOLDS, WELL),
-    Condition("tipped", lambda f, p: not (f.armed and f.tilt > p.tipped), "tipped_time", CUTS_ANYWHERE, LATCHED),
+    Condition("tipped", lambda f, p: not (f.armed and p.tipped < f.tilt < inf), "tipped_time", CUTS_ANYWHERE, LATCHED),
     Condition("fence", lambda f, p: _inside(f, p, 0.0), "fence_time", HOLDS, WELL),
     Condition("fence_breached", lambda f, p: _inside(f, p, p.fence_margin), "fence_time", LANDS, LATCHED),
 
@@ -291,9 +293,9 @@ TABLE: Final[tuple[Condition, ...]] = (
                             and f.battery_voltage >= p.battery_critical_voltage),
               "battery_time", LANDS, LATCHED),
 
-    Condition("tick_late", lambda f, p: f.dt <= p.tick_late, None, WARNS, WELL),
-    Condition("tick_slow", lambda f, p: f.dt <= p.tick_slow, "tick_slow_time", HOLDS, WELL),
-    Condition("tick_stalled", lambda f, p: f.dt <= p.tick_slow, "tick_stalled_time", LANDS, LATCHED),
+    Condition("tick_late", lambda f, p: 0.0 <= f.dt <= p.tick_late, None, WARNS, WELL),
+    Condition("tick_slow", lambda f, p: 0.0 <= f.dt <= p.tick_slow, "tick_slow_time", HOLDS, WELL),
+    Condition("tick_stalled", lambda f, p: 0.0 <= f.dt <= p.tick_slow, "tick_stalled_time", LANDS, LATCHED),
 )
 # fmt: on
 
