@@ -22,7 +22,8 @@ class DeviceSet:
 def world_of(config: Config) -> World:
     """The simulated world of a configuration."""
     pipe = config.pipe
-    return World(config.vehicle, config.world, pipe.position, radians(pipe.heading_deg), pipe.radius, config.seed)
+    heading = radians(pipe.heading_deg)
+    return World(config.vehicle, config.world, pipe.position, heading, pipe.radius, pipe.length, config.seed)
 
 
 def mock_devices(world: World) -> DeviceSet:

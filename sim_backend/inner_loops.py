@@ -71,7 +71,7 @@ def put_loops(p: Array, vehicle: Vehicle, params: LoopParams, joints: Three, ste
     if steps < 1 or abs(steps * step - params.period) > 1e-9:
         raise ValueError(f"loops.period {params.period} s is not a whole number of physics steps of {step} s")
     mass = vehicle.base.mass + vehicle.arm.sleeve.mass + sum(part.mass for part in vehicle.arm.parts)
-    p[at.LOOP : at.CONSTANTS_SIZE] = (
+    p[at.LOOP : at.PIPE_HALF_LENGTH] = (
         params.attitude_gain,
         params.yaw_gain,
         params.yaw_weight,

@@ -116,7 +116,8 @@ LOOP_PERIOD = LOOP + 17  # s
 LOOP_STEPS = LOOP + 18  # physics steps per period
 LOOP_VELOCITY_GAIN = LOOP + 19
 LOOP_MASS = LOOP + 20  # kg, what the autopilot takes the vehicle for
-CONSTANTS_SIZE = LOOP + 21
+PIPE_HALF_LENGTH = LOOP + 21
+CONSTANTS_SIZE = LOOP + 22
 
 # Offsets within one lumped set (see dynamics.py).
 L_MASS = 0

@@ -37,7 +37,8 @@ class State(Struct, frozen=True, gc=False):
     backstepping: backstepping.State = backstepping.State()
     tilt: tilt.State = tilt.State()
     sliding: sliding_mode.State = sliding_mode.State()
-    compensation: compensation.State = compensation.State((0.0, 0.0, 0.0))
+    compensation: compensation.State | None = None
+    """None before the first sample."""
     joint_acceleration: Vec3 = (0.0, 0.0, 0.0)
     contact: float = 0.0
     """0 in free flight to 1 with the force loop closed."""
@@ -159,7 +160,7 @@ def step(
 
 
 def _arm(
-    state: compensation.State, estimate: Estimate, reference: Reference, params: AllParams, dt: float
+    state: compensation.State | None, estimate: Estimate, reference: Reference, params: AllParams, dt: float
 ) -> tuple[compensation.State, Vec3]:
     """Joint reference that holds wrist and tool in the world at the measured pitch."""
     arm = params.vehicle.arm
@@ -171,4 +172,6 @@ def _arm(
     a, b, c, d = kinematics.wrist_jacobian_inverse(arm, theta_1, theta_2)
     target = (theta_1, theta_2, reference.elevation + pitch)
     rate = (a * vx + b * vz, c * vx + d * vz, reference.elevation_rate + pitch_rate)
+    if state is None:
+        state = compensation.State(estimate.joints)
     return compensation.step(state, target, rate, params.compensation, dt)

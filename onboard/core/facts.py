@@ -11,6 +11,7 @@ from onboard.core.guidance import Progress
 from onboard.core.types import Estimate, Inputs, Phase, Reference, Verdict
 
 if TYPE_CHECKING:
+    from onboard.core import compensation
     from onboard.core import estimate as estimating
     from onboard.core.derived import Derived
     from onboard.core.params import Params
@@ -34,9 +35,9 @@ def airborne(before: bool, seen: estimating.State, believed: Estimate, home_heig
 
 def for_safety(
     seen: estimating.State, believed: Estimate, inputs: Inputs, phase: Phase, flying: bool, engaged_before: bool,
-    reference: Reference | None, joints: tuple[float, float, float],
+    reference: Reference | None, arm: compensation.State | None,
 ) -> safety.Facts:  # fmt: skip
-    """Facts of one tick. joints: the reference of the joint law, rad."""
+    """Facts of one tick. arm: the joint reference."""
     odometry, autopilot, servos = seen.odometry, seen.autopilot, seen.servos
     if odometry is None or autopilot is None or servos is None:
         return safety.Facts(
@@ -46,6 +47,7 @@ def for_safety(
         )  # fmt: skip
     f = believed.force_W
     now = believed.joints
+    joints = arm.joints if arm is not None else now
     errors = servos.error
     return safety.Facts(
         phase,

@@ -97,7 +97,7 @@ class Progress(Struct, frozen=True, gc=False):
 def initial() -> State:
     """Before the first sample: nothing is followed."""
     return State(
-        phase=Phase.PREFLIGHT, legs=(), index=0, time=0.0, start=ZERO, start_rate=ZERO, start_acceleration=ZERO,
+        phase=Phase.STOPPED, legs=(), index=0, time=0.0, start=ZERO, start_rate=ZERO, start_acceleration=ZERO,
         moving=False, at=ZERO, rate=ZERO, acceleration=ZERO, home=ZERO, settled=0.0, clock=0.0, lift=0.0,
         press_time=0.0, press_start=0.0, force=0.0, easing=-1.0, admittance=admittance.State(), released_for=0.0,
     )  # fmt: skip
@@ -132,10 +132,12 @@ def step(
     engaged: the autopilot follows our set-points; pump: measured angle of the pump servo, rad.
     """
     own, site = params.guidance, derived.site
+    if not estimate.valid:
+        return state, _reference(state, params, 0.0, False), Progress()
     if phase is not state.phase:
         state = _enter(state, phase, estimate, pump, derived, params)
     if phase in STANDING:
-        here = measured(estimate, pump, params.vehicle)
+        here: Eight = (*measured(estimate, pump, params.vehicle)[:4], *state.at[4:])
         state = replace(state, at=here, home=here)
         return state, _reference(state, params, 0.0, False), Progress()
 
@@ -227,7 +229,7 @@ def _reference(state: State, params: AllParams, compliant: float, pressing: bool
 def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived: Derived, params: AllParams) -> State:
     """The state with the plan of ``phase``, begun where the reference is."""
     before, site = state.phase, derived.site
-    if before in STANDING:
+    if before in STANDING or phase in STANDING:
         state = _start_from(replace(state, released_for=0.0), measured(estimate, pump, params.vehicle))
     force = state.force
     easing = -1.0

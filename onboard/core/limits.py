@@ -13,7 +13,7 @@ Commands that need no change leave as the same objects.
 
 from __future__ import annotations
 
-from math import acos, cos, hypot, sin, sqrt
+from math import acos, cos, hypot, pi, sin, sqrt
 from typing import Annotated, Final
 
 from msgspec import Struct
@@ -147,9 +147,10 @@ def step(
 ) -> tuple[State, AutopilotCommand, ServoCommand, Clips]:
     """One tick: the commands that may leave, and the names of the limits that changed them.
 
-    dt: time that the rates are applied to, s; one that is not a positive number allows no change.
+    dt: time that the rates are applied to, s; one that is not a positive number allows no change, and none counts
+    as more than a second.
     """
-    dt = dt if dt > 0.0 else 0.0
+    dt = min(1.0, dt) if dt > 0.0 else 0.0
     bad_ticks, landing = 0, state.landing
     clips: Clips = ()
     if _finite_autopilot(autopilot):
@@ -232,7 +233,7 @@ def _bounded(
         if rate is not command.w_WB_B:
             clips = (*clips, "body_rate")
     else:
-        start_q = measured.q_WB if last is None or taking_over else last.q_WB
+        start_q = _known(measured.q_WB) if last is None or taking_over else last.q_WB
         q, clips = _attitude(start_q, q, bounds, dt, clips)
     if clips is before:
         return command, clips
@@ -254,6 +255,14 @@ def _within(value: Vec3, bound: Vec3) -> Vec3:
     if -bx <= x <= bx and -by <= y <= by and -bz <= z <= bz:
         return value
     return (min(bx, max(-bx, x)), min(by, max(-by, y)), min(bz, max(-bz, z)))
+
+
+def _known(q: Quat | None) -> Quat | None:
+    """A measured attitude, if it is one."""
+    if q is None:
+        return None
+    w, x, y, z = q
+    return q if 0.99 < w * w + x * x + y * y + z * z < 1.01 else None
 
 
 def _attitude(start: Quat | None, q: Quat, bounds: Bounds, dt: float, clips: Clips) -> tuple[Quat, Clips]:
@@ -292,10 +301,12 @@ def _upright(q: Quat, bounds: Bounds) -> Quat:
 
 def _turned(start: Quat, q: Quat, angle: float) -> Quat:
     """From ``start`` towards ``q`` by at most ``angle`` (rad); the same object when it is no farther."""
+    if angle >= pi:
+        return q
     w, x, y, z = start
     a, b, c, d = q
     dot = w * a + x * b + y * c + z * d
-    if not abs(dot) < cos(0.5 * angle) - _SLACK:
+    if abs(dot) >= cos(0.5 * angle) - _SLACK:
         return q
     sign = 1.0 if dot >= 0.0 else -1.0
     # The relative rotation start^-1 q has the vector part v; its direction is the axis in B.

@@ -7,7 +7,7 @@ points into the pipe; the base always stands at crack - distance * n, its arm mo
 
 from __future__ import annotations
 
-from math import cos, hypot, pi, radians, sin
+from math import cos, hypot, inf, pi, radians, sin
 from typing import Annotated
 
 from msgspec import Struct
@@ -119,10 +119,11 @@ def survey(pipe: Pipe, vehicle: Vehicle, params: Params) -> Site:
         raise Infeasible("plan.needle_reach / plan.press_reach: the propellers would come closer than 5 cm to the pipe")
     if hypot(x, y) > 50.0:
         raise Infeasible(f"pipe.position: {hypot(x, y):.0f} m from the start; at most 50 m")
-    near_home = hypot(x * normal[0] + y * normal[1], z - params.takeoff_height)
-    if near_home < params.clearance and abs(x * normal[0] + y * normal[1]) < params.clearance:
+    near_home = _from_pipe((0.0, 0.0, 0.0), (0.0, 0.0, params.takeoff_height), pipe, normal)
+    if near_home < params.clearance:
         raise Infeasible(
-            f"pipe.position {pipe.position}: the pipe passes {near_home:.2f} m from the take-off path; at least {params.clearance} m is needed"
+            f"pipe.position {pipe.position}: the pipe passes {near_home:.2f} m from the take-off path; "
+            f"at least {params.clearance} m is needed"
         )
     if not _reaches(params.press_reach, 0.0, vehicle):
         raise Infeasible(f"plan.press_reach = {params.press_reach} m: the arm cannot hold the wrist there")
@@ -220,16 +221,25 @@ class Path:
 
 def route(start: Eight, goal: Vec3, pipe: Pipe, site: Site, params: Params) -> list[Vec3]:
     """Way-points to ``goal`` that keep ``clearance`` from the pipe's axis: straight, or over the top."""
-    x, y, z = pipe.position
-    n = site.normal
-
-    def across(p: tuple[float, ...]) -> tuple[float, float]:
-        return (p[0] - x) * n[0] + (p[1] - y) * n[1], p[2] - z
-
-    if _segment_distance(across(start), across(goal), (0.0, 0.0)) >= params.clearance:
+    at = (start[0], start[1], start[2])
+    if _from_pipe(at, goal, pipe, site.normal) >= params.clearance:
         return [goal]
-    top = max(z + params.clearance + 0.1, start[2], goal[2])
+    top = max(pipe.position[2] + params.clearance + 0.1, start[2], goal[2])
     return [(start[0], start[1], top), (goal[0], goal[1], top), goal]
+
+
+def _from_pipe(a: Vec3, b: Vec3, pipe: Pipe, normal: tuple[float, float]) -> float:
+    """Least distance (m) of the way from a to b from the pipe's axis, sampled every few centimetres."""
+    x, y, z = pipe.position
+    half = 0.5 * pipe.length
+    count = 1 + int(20.0 * (abs(b[0] - a[0]) + abs(b[1] - a[1]) + abs(b[2] - a[2])))
+    least = inf
+    for k in range(count + 1):
+        u = k / count
+        dx, dy, dz = a[0] + u * (b[0] - a[0]) - x, a[1] + u * (b[1] - a[1]) - y, a[2] + u * (b[2] - a[2]) - z
+        beyond = max(0.0, abs(dy * normal[0] - dx * normal[1]) - half)
+        least = min(least, hypot(dx * normal[0] + dy * normal[1], beyond, dz))
+    return least
 
 
 def beside(site: Site, distance: float) -> Vec3:

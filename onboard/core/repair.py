@@ -23,6 +23,15 @@ class Pipe(Struct, frozen=True, forbid_unknown_fields=True):
             extra={"unit": "deg", "in_flight": False},
         ),
     ] = 0.0
+    length: Annotated[
+        float,
+        Meta(
+            ge=0.2,
+            le=50.0,
+            description="length, half of it to either side of the crack; routes keep clear of all of it",
+            extra={"unit": "m", "in_flight": False},
+        ),
+    ] = 2.0
     radius: Annotated[float, Meta(ge=0.03, le=0.15, description="outer radius", extra={"unit": "m", "in_flight": False})] = 0.08
 
 

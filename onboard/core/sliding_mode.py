@@ -46,8 +46,8 @@ class Gains(Struct, frozen=True, forbid_unknown_fields=True):
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
     """Gains of the attitude axes and of the joints."""
 
-    attitude: Gains = Gains()
-    joints: Gains = Gains()
+    attitude: Gains = Gains(integral=5.0)
+    joints: Gains = Gains(integral=2.0)
 
 
 class State(Struct, frozen=True, gc=False):

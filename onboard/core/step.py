@@ -48,7 +48,7 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
     )
     flying = facts.airborne(state.airborne, seen, believed, state.guidance.home[2], lift)
     dangers = facts.for_safety(
-        seen, believed, inputs, before, flying, state.engaged, state.reference, state.control.compensation.joints
+        seen, believed, inputs, before, flying, state.engaged, state.reference, state.control.compensation
     )
     safe, verdict, alarms = safety.step(state.safety, dangers, params.safety, dt)
     known = facts.for_mission(seen, believed, state.progress, before, flying, verdict, derived, params)
