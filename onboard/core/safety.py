@@ -52,7 +52,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     autopilot_lost: Annotated[float, spec("s", 0.02, 5.0, "age at which the attitude is lost")] = 0.4
     servos_late: Annotated[float, spec("s", 0.01, 2.0, "age of the servo state")] = 0.10
     servos_lost: Annotated[float, spec("s", 0.02, 5.0, "age at which the arm is lost")] = 0.5
-    offboard_lost_time: Annotated[float, spec("s", 0.0, 5.0, "out of offboard")] = 0.10
+    offboard_lost_time: Annotated[float, spec("s", 0.0, 5.0, "out of offboard")] = 0.0
     disarmed_time: Annotated[float, spec("s", 0.0, 5.0, "disarmed in flight")] = 0.30
 
     tilt: Annotated[float, spec("rad", 0.1, 1.5, "of the body")] = 0.60
@@ -149,7 +149,7 @@ class Facts(Struct, frozen=True, gc=False):
     inputs_finite: bool
     """Everything that came from the devices is finite."""
     offboard_lost: bool
-    """The autopilot was in offboard and has left it without being asked."""
+    """The autopilot was in offboard and has left it without being asked; true in that tick, or from then on."""
     disagreement: float = 0.0
     """Angle between the verticals of odometry and autopilot, rad."""
 

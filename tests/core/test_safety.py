@@ -61,7 +61,7 @@ CASES = [
     Case("autopilot_late", {"age_autopilot": 0.1}, {"age_autopilot": 0.101}, 0.0, HOLD, RETREAT),
     Case("autopilot_lost", {"age_autopilot": 0.4}, {"age_autopilot": 0.401}, 0.0, LAND, LAND, latched=True,
          also=("autopilot_late",)),
-    Case("offboard_lost", {}, {"offboard_lost": True}, 0.1, LAND, LAND, latched=True),
+    Case("offboard_lost", {}, {"offboard_lost": True}, 0.0, LAND, LAND, latched=True),
     Case("disarmed", {}, {"armed": False}, 0.3, KILL, KILL, latched=True),
     Case("servos_late", {"age_servos": 0.1}, {"age_servos": 0.101}, 0.0, WARN, WARN),
     Case("servos_lost", {"age_servos": 0.5}, {"age_servos": 0.501}, 0.0, HOLD, RETREAT, latched=True,
