@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from math import inf, isfinite
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import numpy as np
 from msgspec import Struct
@@ -51,7 +51,7 @@ class Descent(Struct, frozen=True, gc=False):
 _KINDS = {Interface.WRENCH: loops.WRENCH, Interface.ATTITUDE: loops.ATTITUDE, Interface.BODY_RATE: loops.BODY_RATE}
 
 
-def drive(u: Array, demand: SetPoint | Descent | None) -> None:
+def _drive(u: Array, demand: SetPoint | Descent | None) -> None:
     """Write into ``u`` what the inner loops shall follow; None stops the motors."""
     if demand is None:
         u[at.U_SETPOINT] = loops.NONE
@@ -64,31 +64,6 @@ def drive(u: Array, demand: SetPoint | Descent | None) -> None:
         u[at.U_BODY_TORQUE : at.U_BODY_TORQUE + 3] = demand.torque_B
         u[at.U_ATTITUDE : at.U_ATTITUDE + 4] = demand.q_WB
         u[at.U_BODY_RATE : at.U_BODY_RATE + 3] = demand.w_WB_B
-
-
-class Pilot(Protocol):
-    """What the world asks for the demand on its inner loops."""
-
-    def next_change(self) -> float:
-        """Simulated time at which the demand changes by itself, s; infinity when that is not known."""
-
-    def update(self, t: float, on_ground: bool, speed: float, u: Array) -> None:
-        """Bring the demand in ``u`` up to time ``t`` (s); ``speed`` (m/s) is the body's."""
-
-
-class Follower:
-    """A pilot without rules of its own: flies the demand that somebody else has decided."""
-
-    def __init__(self) -> None:
-        self.demand: SetPoint | Descent | None = None
-
-    def next_change(self) -> float:
-        """Not known."""
-        return inf
-
-    def update(self, t: float, on_ground: bool, speed: float, u: Array) -> None:
-        """Hand the demand on."""
-        drive(u, self.demand)
 
 
 class Autopilot:
@@ -174,11 +149,11 @@ class Autopilot:
         while self._pending and self._pending[0][0] <= t + 1e-9:
             self._setpoint = self._pending.popleft()[1]
         if not self.armed:
-            drive(u, None)
+            _drive(u, None)
         elif self.mode is FlightMode.OFFBOARD:
-            drive(u, self._setpoint)
+            _drive(u, self._setpoint)
         else:
-            drive(u, Descent(params.descent_speed if self.mode is FlightMode.LAND else 0.0))
+            _drive(u, Descent(params.descent_speed if self.mode is FlightMode.LAND else 0.0))
 
     def _detect_land(self, t: float, on_ground: bool, speed: float) -> None:
         if not on_ground:

@@ -22,6 +22,14 @@ FRAME_POINTS = 8
 #: Modes of a bristle.
 FREE, STICK, SLIDE = 0.0, 1.0, 2.0
 
+#: A contact slower than this does not slide, m/s.
+STANDSTILL = 1e-9
+
+
+def _check_friction(static: float, kinetic: float) -> None:
+    if kinetic > static:
+        raise ValueError(f"friction_kinetic {kinetic} is above friction_static {static}; it must not be")
+
 
 class ContactParams(Struct, frozen=True, forbid_unknown_fields=True):
     """Sleeve on pipe. Stiffness, damping and both friction coefficients: the paper, section VII."""
@@ -34,6 +42,9 @@ class ContactParams(Struct, frozen=True, forbid_unknown_fields=True):
     tangential_damping: Annotated[float, knob("N s/m", "damping of the sticking contact", 0.0, 1e3)] = 40.0
     release_angle: Annotated[float, knob("rad", "gripper angle beyond which the sleeve is let go", 0.05, 3.0)] = 0.8
 
+    def __post_init__(self) -> None:
+        _check_friction(self.friction_static, self.friction_kinetic)
+
 
 class GroundParams(Struct, frozen=True, forbid_unknown_fields=True):
     """Ground under skids, rotor hubs and arm: firm soil; values chosen for a sink of 0.3 mm and no bounce."""
@@ -45,6 +56,9 @@ class GroundParams(Struct, frozen=True, forbid_unknown_fields=True):
     tangential_stiffness: Annotated[float, knob("N/m", "stiffness of the sticking contact", 1e2, 1e6)] = 10e3
     tangential_damping: Annotated[float, knob("N s/m", "damping of the sticking contact", 0.0, 1e3)] = 100.0
     crash_speed: Annotated[float, knob("m/s", "a faster hit breaks the vehicle", 0.1, 20.0)] = 2.0
+
+    def __post_init__(self) -> None:
+        _check_friction(self.friction_static, self.friction_kinetic)
 
 
 @compiled()
@@ -82,7 +96,7 @@ def friction(
         z1, z2 = -f1, -f2
     speed = sqrt(v1 * v1 + v2 * v2)
     limit = kinetic * normal
-    if v1 * z1 + v2 * z2 <= 0.0:
+    if v1 * z1 + v2 * z2 <= 0.0 or speed < STANDSTILL:
         length = sqrt(z1 * z1 + z2 * z2)
         scale = limit / (stiffness * length) if length > 0.0 else 0.0
         z1 *= scale
@@ -109,7 +123,8 @@ def pipe_contact(x: Array, p: Array, tip: Three, velocity: Three) -> Three:
     ahead = rx * nx + ry * ny
     distance = sqrt(ahead * ahead + up * up)
     penetration = p[at.PIPE_RADIUS] - distance
-    if penetration <= 0.0 or distance == 0.0:
+    beyond = abs(ry * nx - rx * ny) > p[at.PIPE_HALF_LENGTH]
+    if penetration <= 0.0 or distance == 0.0 or beyond:
         x[at.CONTACT_MODE] = FREE
         x[at.CONTACT_STRETCH] = 0.0
         x[at.CONTACT_STRETCH + 1] = 0.0

@@ -35,6 +35,12 @@ class LoopParams(Struct, frozen=True, forbid_unknown_fields=True):
     yaw_weight: Annotated[float, knob("1", "priority of yaw against tilt", 0.1, 1.0)] = 0.4
     rate_limit: Annotated[float, knob("rad/s", "largest roll and pitch rate asked for", 0.1, 30.0)] = 3.84
     yaw_rate_limit: Annotated[float, knob("rad/s", "largest yaw rate asked for", 0.1, 10.0)] = 3.49
+    tuned_at: tuple[
+        Annotated[float, knob("rad", "theta_1 of the arm pose that the rate loop is tuned in", -3.2, 3.2)],
+        Annotated[float, knob("rad", "theta_2 of it", -3.2, 3.2)],
+        Annotated[float, knob("rad", "theta_3 of it", -3.2, 3.2)],
+    ] = (-0.72, 0.72, 0.0)
+    """The working pose, wrist 0.30 m ahead of the mount; folded, the inertia is less and the loop faster."""
     bandwidth: Annotated[float, knob("rad/s", "bandwidth of the roll and pitch rate loop", 1.0, 100.0)] = 30.0
     yaw_bandwidth: Annotated[float, knob("rad/s", "bandwidth of the yaw rate loop", 0.5, 50.0)] = 10.0
     integral_gain: Annotated[float, knob("1/s", "integral over proportional gain of the rate loop", 0.0, 20.0)] = 2.0
@@ -65,13 +71,13 @@ def airframe_inertia(vehicle: Vehicle, joints: Three) -> Three:
     return (float(total[0, 0]), float(total[1, 1]), float(total[2, 2]))
 
 
-def put_loops(p: Array, vehicle: Vehicle, params: LoopParams, joints: Three, step: float) -> None:
-    """Write the gains into ``p``; ``joints`` is the arm pose whose inertia the rate loop is tuned to."""
+def put_loops(p: Array, vehicle: Vehicle, params: LoopParams, step: float) -> None:
+    """Write the gains into ``p``."""
     steps = round(params.period / step)
     if steps < 1 or abs(steps * step - params.period) > 1e-9:
         raise ValueError(f"loops.period {params.period} s is not a whole number of physics steps of {step} s")
     mass = vehicle.base.mass + vehicle.arm.sleeve.mass + sum(part.mass for part in vehicle.arm.parts)
-    p[at.LOOP : at.PIPE_HALF_LENGTH] = (
+    p[at.LOOP : at.CONSTANTS_SIZE] = (
         params.attitude_gain,
         params.yaw_gain,
         params.yaw_weight,
@@ -86,7 +92,7 @@ def put_loops(p: Array, vehicle: Vehicle, params: LoopParams, joints: Three, ste
         params.integral_limit,
         params.integral_limit,
         params.yaw_integral_limit,
-        *airframe_inertia(vehicle, joints),
+        *airframe_inertia(vehicle, params.tuned_at),
         params.period,
         steps,
         params.velocity_gain,

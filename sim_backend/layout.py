@@ -99,7 +99,8 @@ BATTERY_CAPACITY = 62  # A s
 HOVER_CURRENT = 63
 HOVER_THRUST = 64  # N, all rotors
 RATED_VOLTAGE = 65  # 0: the voltage does not limit the thrust
-LUMPED = 66  # 2 x LUMPED_SIZE: without and with the payload
+PIPE_HALF_LENGTH = 66
+LUMPED = 67  # 2 x LUMPED_SIZE: without and with the payload
 LUMPED_SIZE = 38
 # Gains of the autopilot's inner loops.
 LOOP = LUMPED + 2 * LUMPED_SIZE
@@ -116,8 +117,7 @@ LOOP_PERIOD = LOOP + 17  # s
 LOOP_STEPS = LOOP + 18  # physics steps per period
 LOOP_VELOCITY_GAIN = LOOP + 19
 LOOP_MASS = LOOP + 20  # kg, what the autopilot takes the vehicle for
-PIPE_HALF_LENGTH = LOOP + 21
-CONSTANTS_SIZE = LOOP + 22
+CONSTANTS_SIZE = LOOP + 21
 
 # Offsets within one lumped set (see dynamics.py).
 L_MASS = 0

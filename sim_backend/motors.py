@@ -55,15 +55,15 @@ def rotors(x: Array, p: Array, u: Array) -> tuple[float, float, float, float]:
 
 
 @compiled()
-def battery(x: Array, p: Array, duration: float) -> None:
-    """Discharge the battery over ``duration`` seconds at the present thrust; set its voltage and the rotors' limit.
+def battery(x: Array, p: Array, step: float) -> None:
+    """Discharge the battery over one step at the present thrust; set its voltage and the rotors' limit.
 
     The current goes with thrust^1.5 (induced power); the open-circuit voltage falls linearly with the charge.
     """
     thrust = x[at.ROTOR] + x[at.ROTOR + 1] + x[at.ROTOR + 2] + x[at.ROTOR + 3]
     share = max(0.0, thrust / p[at.HOVER_THRUST])
     current = p[at.HOVER_CURRENT] * share * sqrt(share)
-    x[at.CHARGE] = max(0.0, x[at.CHARGE] - current * duration / p[at.BATTERY_CAPACITY])
+    x[at.CHARGE] = max(0.0, x[at.CHARGE] - current * step / p[at.BATTERY_CAPACITY])
     open_circuit = p[at.BATTERY_EMPTY] + (p[at.BATTERY_FULL] - p[at.BATTERY_EMPTY]) * x[at.CHARGE]
     x[at.VOLTAGE] = open_circuit - p[at.BATTERY_RESISTANCE] * current
     share = x[at.VOLTAGE] / p[at.RATED_VOLTAGE] if p[at.RATED_VOLTAGE] > 0.0 else 1.0

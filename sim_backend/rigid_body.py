@@ -36,11 +36,13 @@ CRASHES = (
     "propeller struck the pipe, {:.3f} m from its axis",
 )
 
+StartAngle = Annotated[float, knob("rad", "joint angle that the servos hold at the start", -4.0, 4.0)]
+
 
 class PlantParams(Struct, frozen=True, forbid_unknown_fields=True):
     """How the rigid-body plant is simulated, and which parts of it are ideal."""
 
-    step: Annotated[float, knob("s", "physics step", 1e-5, 5e-4)] = 1e-4
+    step: Annotated[float, knob("s", "physics step", 1e-5, 2e-4)] = 1e-4
     ideal_motors: Annotated[bool, switch("no thrust lag, full thrust at any battery voltage")] = True
     ideal_servos: Annotated[bool, switch("no gear friction, exact position, current proportional to torque")] = True
     tool_servo_time: Annotated[float, knob("s", "time constant of the pump and gripper servos", 0.005, 1.0)] = 0.04
@@ -49,8 +51,8 @@ class PlantParams(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.02
     stop_stiffness: Annotated[float, knob("N m/rad", "mechanical stops of the joints", 1.0, 200.0)] = 50.0
     stop_damping: Annotated[float, knob("N m s/rad", "mechanical stops of the joints", 0.0, 5.0)] = 0.5
-    start_joints: tuple[float, float, float] = (-2.80, -0.35, 0.0)
-    """Joint angles at the start, rad: the arm folded above the ground."""
+    start_joints: tuple[StartAngle, StartAngle, StartAngle] = (-2.80, -0.35, 0.0)
+    """The arm folded above the ground."""
     contact: ContactParams = ContactParams()
     ground: GroundParams = GroundParams()
 
@@ -296,7 +298,8 @@ def _watch(x: Array, p: Array) -> None:
         up = x[at.POSITION + 2] + zx * bx + zy * by - p[at.PIPE_POINT + 2]
         ahead = dx * nx + dy * ny
         away = hypot(ahead, up)
-        if away > p[at.PIPE_RADIUS] + p[at.ROTOR_RADIUS]:
+        beside = abs(dy * nx - dx * ny) - p[at.PIPE_HALF_LENGTH]
+        if away > p[at.PIPE_RADIUS] + p[at.ROTOR_RADIUS] or beside > p[at.ROTOR_RADIUS]:
             continue
         # The point of the disc nearest to the axis: from the hub along the way to the axis, laid into the disc.
         lean = -(ahead * tilt_a + up * zz)
@@ -318,9 +321,9 @@ def physics(x: Array, p: Array, u: Array, steps: int) -> None:
     step = p[at.STEP]
     drift(x, 0.5 * step)
     for i in range(steps):
+        battery(x, p, step)
         _kick(x, p, u)
         drift(x, step if i + 1 < steps else 0.5 * step)
-    battery(x, p, steps * step)
     _tips(x, p)
     _watch(x, p)
 
@@ -335,7 +338,12 @@ def advance(x: Array, p: Array, u: Array, steps: int) -> None:
 
 
 def constants(
-    vehicle: Vehicle, params: PlantParams, pipe_position: Vec3, pipe_heading: float, pipe_radius: float
+    vehicle: Vehicle,
+    params: PlantParams,
+    pipe_position: Vec3,
+    pipe_heading: float,
+    pipe_radius: float,
+    pipe_length: float,
 ) -> Array:
     """Array ``p`` for a vehicle and a pipe (without the autopilot's gains)."""
     p = np.zeros(at.CONSTANTS_SIZE)
@@ -354,6 +362,7 @@ def constants(
     put(at.SERVO_STIFFNESS, servo.stiffness, servo.damping, float(params.ideal_servos))
     put(at.TOOL_SERVO_GAIN, lag_gain(step, params.tool_servo_time))
     put(at.PIPE_POINT, *pipe_position, cos(pipe_heading), sin(pipe_heading), pipe_radius)
+    put(at.PIPE_HALF_LENGTH, 0.5 * pipe_length)
     put(at.CONTACT_STIFFNESS, contact.stiffness, contact.damping)
     put(at.CONTACT_TANGENTIAL_STIFFNESS, contact.tangential_stiffness, contact.tangential_damping)
     put(at.CONTACT_STATIC, contact.friction_static, contact.friction_kinetic, contact.release_angle)
@@ -377,16 +386,23 @@ class RigidBody:
     """The vehicle and one horizontal pipe; a ``Plant``.
 
     It starts standing at the origin of W, at rest, arm folded and held by its servos, sleeve in the gripper.
-    ``pipe_position`` (m, W) is a point of the pipe's axis; ``pipe_heading`` (rad) the horizontal direction in which
-    the vehicle presses, to which the axis is square. ``x``, ``p`` and ``u`` are the arrays of ``layout``.
+    ``pipe_position`` (m, W) is the middle of the pipe's axis, ``pipe_heading`` (rad) the horizontal direction in
+    which the vehicle presses, to which the axis is square; ``pipe_radius`` and ``pipe_length`` in m. ``x``, ``p`` and
+    ``u`` are the arrays of ``layout``.
     """
 
     def __init__(
-        self, vehicle: Vehicle, params: PlantParams, pipe_position: Vec3, pipe_heading: float, pipe_radius: float
+        self,
+        vehicle: Vehicle,
+        params: PlantParams,
+        pipe_position: Vec3,
+        pipe_heading: float,
+        pipe_radius: float,
+        pipe_length: float = 2.0,
     ) -> None:
         self.vehicle = vehicle
         self.params = params
-        self.p = constants(vehicle, params, pipe_position, pipe_heading, pipe_radius)
+        self.p = constants(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length)
         self.x = np.zeros(at.STATE_SIZE)
         self.u = np.zeros(at.DRIVE_SIZE)
         self.steps = 0

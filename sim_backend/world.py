@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drivers.samples import JointMode, ServoCommand, Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
-from sim_backend.autopilot import Autopilot, AutopilotParams, Pilot
+from sim_backend.autopilot import Autopilot, AutopilotParams
 from sim_backend.compiled import compiled
 from sim_backend.inner_loops import LoopParams, inner_loops, put_loops
 from sim_backend.plant import Truth
@@ -20,8 +20,8 @@ from sim_backend.sensors import SensorParams, Sensors, Snapshot
 
 Array = NDArray[np.float64]
 
-#: The pilot is asked no less often than this, s.
-PILOT_PERIOD = 0.02
+#: The autopilot's modes are looked at no less often than this, s.
+MODE_PERIOD = 0.02
 
 
 class WorldParams(Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,9 +52,10 @@ def _fly(x: Array, p: Array, u: Array, steps: int) -> None:
 class World:
     """A vehicle, a pipe, and time. Deterministic: same seed and calls, same bits.
 
-    ``pipe_position`` (m, W) is a point of the pipe's axis, ``pipe_heading`` (rad) the horizontal direction in which
-    the vehicle presses (the axis is square to it), ``pipe_radius`` in m. The vehicle starts at rest on the ground at
-    the origin, disarmed, the sleeve in the gripper, the arm folded and held by its servos until they are commanded.
+    ``pipe_position`` (m, W) is the middle of the pipe's axis, ``pipe_heading`` (rad) the horizontal direction in
+    which the vehicle presses (the axis is square to it), ``pipe_radius`` and ``pipe_length`` in m. The vehicle starts
+    at rest on the ground at the origin, disarmed, the sleeve in the gripper, the arm folded and held by its servos
+    until they are commanded.
 
     One thread advances the world; others may read ``snapshot`` and ``truth`` and command the servos meanwhile.
     """
@@ -66,19 +67,19 @@ class World:
         pipe_position: Vec3 = (2.0, 0.0, 1.5),
         pipe_heading: float = 0.0,
         pipe_radius: float = 0.08,
+        pipe_length: float = 2.0,
         seed: int = 0,
     ) -> None:
         self.vehicle = vehicle
         self.params = params = params or WorldParams()
-        self.plant = RigidBody(vehicle, params.plant, pipe_position, pipe_heading, pipe_radius)
-        put_loops(self.plant.p, vehicle, params.loops, params.plant.start_joints, params.plant.step)
+        self.plant = RigidBody(vehicle, params.plant, pipe_position, pipe_heading, pipe_radius, pipe_length)
+        put_loops(self.plant.p, vehicle, params.loops, params.plant.step)
         self.autopilot = Autopilot(params.autopilot)
-        #: Who decides what the inner loops follow; a stand-in for a real autopilot puts itself here.
-        self.pilot: Pilot = self.autopilot
         self.sensors = Sensors(params.sensors, vehicle, seed)
         self._servo_command: ServoCommand | None = None
         self.snapshot = self._look(self.plant.x.tolist(), self.plant.last_steps)
         self.sensors.observe(self.snapshot)
+        self._truth = (self.snapshot, self.plant.truth())
 
     @property
     def time(self) -> float:
@@ -88,7 +89,11 @@ class World:
     def truth(self) -> Truth:
         """What is true after the last advance."""
         now = self.snapshot
-        return truth_of(now.x, now.t_ns * 1e-9, now.steps)
+        seen, truth = self._truth
+        if seen is not now:
+            truth = truth_of(now.x, now.t_ns * 1e-9, now.steps)
+            self._truth = (now, truth)
+        return truth
 
     def command_servos(self, command: ServoCommand) -> None:
         """Set the goals of the five servos, from the next advance on; one that is not finite is ignored."""
@@ -100,7 +105,7 @@ class World:
         plant = self.plant
         x, u, step = plant.x, plant.u, plant.params.step
         left = total = plant.steps_of(duration)
-        longest = ceil(PILOT_PERIOD / step)
+        longest = ceil(MODE_PERIOD / step)
         x[at.CONTACT_PEAK] = 0.0
         x[at.SPECIFIC_FORCE_SUM : at.SPECIFIC_FORCE_SUM + 3] = 0.0
         command, self._servo_command = self._servo_command, None
@@ -114,8 +119,8 @@ class World:
         while left:
             t = plant.time
             speed = hypot(state[at.VELOCITY], state[at.VELOCITY + 1], state[at.VELOCITY + 2])
-            self.pilot.update(t, state[at.ON_GROUND] != 0.0, speed, u)
-            until = (self.pilot.next_change() - t) / step
+            self.autopilot.update(t, state[at.ON_GROUND] != 0.0, speed, u)
+            until = (self.autopilot.next_change() - t) / step
             count = min(left, longest)
             if until < count:
                 count = max(1, ceil(until - 1e-6))
