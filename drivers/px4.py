@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine
 from enum import IntEnum
+from functools import cache
 from math import isfinite, nan
 from time import monotonic_ns
 from typing import Annotated, Any
@@ -252,7 +253,7 @@ class Px4:
     async def _start(self) -> None:
         url, timeout = self._settings.url, self._settings.timeout
         loop = asyncio.get_running_loop()
-        mavsdk.log_subscribe(lambda level, text, file, line: True)  # what matters of it is told in notices
+        _hush()
         # The onboard computer shares the vehicle's system id, as PX4 expects of a companion.
         configuration = mavsdk.Configuration.create_manual(_SYSTEM, _ONBOARD_COMPUTER, True)
         self._hub = mavsdk.Mavsdk(configuration)
@@ -595,6 +596,12 @@ class Px4:
         if text not in self._refusals:
             self._refusals.add(text)
             self._tell(Level.WARNING, text)
+
+
+@cache
+def _hush() -> None:
+    """Keep MAVSDK from printing, once for the process; what matters of it is told in notices."""
+    mavsdk.log_subscribe(lambda level, text, file, line: True)
 
 
 def _command_json(ask: _Ask) -> str:

@@ -421,8 +421,7 @@ class Px4StandIn:
 
     def _on_timesync(self, m: Any) -> None:
         if m.tc1 == 0:
-            target = (m.get_srcSystem(), m.get_srcComponent())
-            self._send(mavlink.MAVLink_timesync_message(self.world.snapshot.t_ns, m.ts1, *target))
+            self._send(mavlink.MAVLink_timesync_message(self.world.snapshot.t_ns, m.ts1))
 
     def _on_ping(self, m: Any) -> None:
         if m.target_system == 0:

@@ -1,0 +1,282 @@
+"""The PX4 driver over MAVSDK and UDP, against the stand-in: its bytes, its refusals, and what it survives."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from collections.abc import AsyncIterator, Callable
+from math import inf, nan
+from pathlib import Path
+from socket import AF_INET, SOCK_DGRAM, socket
+
+import msgspec
+import pytest
+import pytest_asyncio
+import yaml
+
+from drivers.mailbox import Level
+from drivers.protocols import DeviceError
+from drivers.px4 import Px4, Px4Settings
+from drivers.samples import AutopilotCommand, Engage, FlightMode, Interface, Quat, Vec3
+from drivers.thrust import ThrustMap
+from drivers.vehicle import Vehicle
+from sim_backend.px4_emulator import Px4StandIn
+from sim_backend.world import World
+
+pytestmark = pytest.mark.asyncio
+
+VEHICLE = msgspec.convert(
+    yaml.safe_load((Path(__file__).parents[2] / "configs" / "vehicle.yaml").read_text(encoding="utf-8")), Vehicle
+)
+THRUST = ThrustMap(hover_force=20.0, hover_thrust=0.4, hover_voltage=16.0, curve=0.3, px4_curve=0.3)
+LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
+STILL: Vec3 = (0.0, 0.0, 0.0)
+
+
+def settings(url: str, **changes: float) -> Px4Settings:
+    return msgspec.structs.replace(Px4Settings(thrust=THRUST, url=url, stream_time=0.6), **changes)
+
+
+def command(
+    engage: Engage = Engage.OFFBOARD,
+    thrust: float = 5.0,
+    interface: Interface = Interface.ATTITUDE,
+    q_WB: Quat = LEVEL,
+    w_WB_B: Vec3 = STILL,
+) -> AutopilotCommand:
+    return AutopilotCommand(engage, interface, thrust, STILL, q_WB, w_WB_B)
+
+
+async def until(condition: Callable[[], bool], tick: Callable[[], None] = lambda: None, within: float = 15.0) -> None:
+    """Tick every 4 ms until the condition holds."""
+    loop = asyncio.get_running_loop()
+    end = loop.time() + within
+    while not condition():
+        assert loop.time() < end, "the condition never held"
+        tick()
+        await asyncio.sleep(0.004)
+
+
+@pytest_asyncio.fixture
+async def pair() -> AsyncIterator[tuple[Px4, Px4StandIn]]:
+    stand_in = Px4StandIn(World(VEHICLE))
+    stand_in.start()
+    px4 = Px4(settings(f"udpout://127.0.0.1:{stand_in.port}"))
+    try:
+        await px4.start()
+        yield px4, stand_in
+    finally:
+        await px4.stop()
+        stand_in.stop()
+
+
+def free_port() -> int:
+    with socket(AF_INET, SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+async def test_nobody_there() -> None:
+    px4 = Px4(settings(f"udpin://127.0.0.1:{free_port()}", timeout=0.3))
+    with pytest.raises(DeviceError, match=r"no heartbeat on udpin://127\.0\.0\.1:\d+ within 0\.3 s; is PX4 powered"):
+        await px4.start()
+    assert px4.latest() is None
+    await px4.stop()
+
+
+@pytest.mark.parametrize("url", ["nonsense", "udpin://127.0.0.1:notaport", "serial:///dev/no-such-port:921600"])
+async def test_a_url_that_cannot_be_opened(url: str) -> None:
+    with pytest.raises(DeviceError, match=f"cannot open {url} .*want for example serial:///dev/ttyTHS1:921600"):
+        await Px4(settings(url, timeout=0.3)).start()
+
+
+async def test_a_taken_port() -> None:
+    with socket(AF_INET, SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        with pytest.raises(DeviceError, match=r"cannot open .*no other process on that port"):
+            await Px4(settings(f"udpin://127.0.0.1:{other.getsockname()[1]}", timeout=0.3)).start()
+
+
+async def test_a_message_that_never_comes() -> None:
+    stand_in = Px4StandIn(World(VEHICLE))
+    del stand_in._makers[147]  # no battery monitor
+    stand_in._intervals.pop(147)
+    stand_in.start()
+    px4 = Px4(settings(f"udpout://127.0.0.1:{stand_in.port}", timeout=1.5))
+    try:
+        with pytest.raises(DeviceError, match=r"BATTERY_STATUS never came from udpout://.* within 1\.5 s"):
+            await px4.start()
+    finally:
+        stand_in.stop()
+    assert any("BATTERY_STATUS at 2 Hz: failed" in n.text for n in px4.notices())
+
+
+async def test_command_outside_of_start_and_stop() -> None:
+    with pytest.raises(DeviceError, match="before start"):
+        Px4(settings("udpin://127.0.0.1:0")).command(command())
+
+
+async def test_wrench_is_refused(pair: tuple[Px4, Px4StandIn]) -> None:
+    px4, _ = pair
+    with pytest.raises(DeviceError, match="PX4 accepts no body torques; set the interface to attitude or body_rate"):
+        px4.command(command(interface=Interface.WRENCH))
+    assert px4.sent() == 0
+
+
+async def test_the_bytes_of_an_attitude_set_point(pair: tuple[Px4, Px4StandIn]) -> None:
+    """Facing +y (north), 20 N of 50: q (1, 0, 0, 0) on the wire, thrust 0.4, body rates ignored."""
+    px4, stand_in = pair
+    px4.command(command(thrust=20.0, q_WB=(0.5**0.5, 0.0, 0.0, 0.5**0.5)))
+    await until(lambda: "SET_ATTITUDE_TARGET" in stand_in.newest)
+    raw = bytes(stand_in.newest["SET_ATTITUDE_TARGET"].get_msgbuf())
+    assert raw[0] == 0xFD
+    assert (raw[5], raw[6]) == (1, 191)  # the vehicle's system, its onboard computer
+    assert int.from_bytes(raw[7:10], "little") == 82
+    payload = raw[10:-2].ljust(51, b"\0")  # MAVLink 2 cuts zeros at the end; three extension floats follow
+    _, *q, roll, pitch, yaw, thrust, system, component, mask = struct.unpack("<I8fBBB", payload[:39])
+    assert q == pytest.approx([1.0, 0.0, 0.0, 0.0], abs=1e-6)
+    assert (roll, pitch, yaw) == (0.0, 0.0, 0.0)
+    assert thrust == pytest.approx(0.4, abs=1e-6)
+    assert (system, component, mask) == (1, 1, 0b0000_0111)
+    assert payload[39:] == b"\0" * 12
+
+
+async def test_the_bytes_of_a_body_rate_set_point(pair: tuple[Px4, Px4StandIn]) -> None:
+    """The wire's y and z axes point right and down; the attitude is ignored."""
+    px4, stand_in = pair
+    px4.command(command(thrust=25.0, interface=Interface.BODY_RATE, w_WB_B=(0.1, 0.2, 0.3)))
+    await until(lambda: "SET_ATTITUDE_TARGET" in stand_in.newest)
+    raw = bytes(stand_in.newest["SET_ATTITUDE_TARGET"].get_msgbuf())
+    payload = raw[10:-2].ljust(51, b"\0")
+    _, *_, roll, pitch, yaw, thrust, system, component, mask = struct.unpack("<I8fBBB", payload[:39])
+    assert (roll, pitch, yaw) == pytest.approx((0.1, -0.2, -0.3), abs=1e-6)
+    assert thrust == pytest.approx(0.5, abs=1e-6)
+    assert (system, component, mask) == (1, 1, 0b1000_0000)
+
+
+@pytest.mark.parametrize(
+    "bad", [command(thrust=nan), command(q_WB=(nan, 0.0, 0.0, 0.0)), command(thrust=1.0, q_WB=(inf, -inf, 0.0, 0.0))]
+)
+async def test_what_is_not_finite_is_not_sent(pair: tuple[Px4, Px4StandIn], bad: AutopilotCommand) -> None:
+    px4, stand_in = pair
+    px4.command(bad)
+    px4.command(bad)
+    px4.command(command())
+    await until(lambda: stand_in.received["SET_ATTITUDE_TARGET"] > 0)
+    assert stand_in.received["SET_ATTITUDE_TARGET"] == px4.sent() == 1
+    assert sum("not finite" in n.text for n in px4.notices()) == 1
+
+
+async def test_asked_rates_are_reached(pair: tuple[Px4, Px4StandIn]) -> None:
+    px4, _ = pair
+    await until(lambda: px4.counts()["HIGHRES_IMU"].rate > 0.0 and px4.counts()["ATTITUDE_QUATERNION"].rate > 0.0)
+    await until(
+        lambda: all(px4.counts()[name].rate > 200.0 for name in ("ATTITUDE_QUATERNION", "HIGHRES_IMU")), within=10.0
+    )
+    assert px4.motion() is not None
+    assert px4.ready_to_arm()
+
+
+async def test_offboard_is_not_taken_back_from_a_pilot(pair: tuple[Px4, Px4StandIn]) -> None:
+    px4, stand_in = pair
+    autopilot = stand_in.world.autopilot
+
+    def state() -> tuple[bool, FlightMode]:
+        latest = px4.latest()
+        assert latest is not None
+        return latest.armed, latest.mode
+
+    def tick() -> None:
+        px4.command(command())
+
+    await until(lambda: state() == (True, FlightMode.OFFBOARD), tick)
+    autopilot.mode = FlightMode.HOLD  # the pilot's switch
+    await until(lambda: state()[1] is FlightMode.HOLD, tick)
+    sent = px4.sent()
+    await until(lambda: px4.sent() > sent + 500, tick)
+    assert autopilot.mode is FlightMode.HOLD
+    assert sum("has left offboard by itself" in n.text for n in px4.notices()) == 1
+    await until(lambda: not state()[0], lambda: px4.command(command(Engage.LAND)))
+    await until(lambda: state() == (True, FlightMode.OFFBOARD), tick)
+
+
+async def test_a_refusal_is_told_with_px4s_reason(pair: tuple[Px4, Px4StandIn]) -> None:
+    px4, stand_in = pair
+    stand_in._terminated = True
+    told: list[str] = []
+
+    def tick() -> None:
+        px4.command(command())
+        told.extend(n.text for n in px4.notices())
+
+    want = {"autopilot: arming: temporarily rejected", "PX4: Arming denied: flight terminated"}
+    await until(lambda: want <= set(told), tick)
+
+
+async def test_loss_and_return_of_the_link() -> None:
+    """PX4 reboots: what was told grows old, the loss is told, and after its return the rates are asked for again."""
+    first = Px4StandIn(World(VEHICLE))
+    first.start()
+    port = first.port
+    px4 = Px4(settings(f"udpout://127.0.0.1:{port}"))
+    told: list[tuple[Level, str]] = []
+
+    def listen() -> None:
+        told.extend((n.level, n.text) for n in px4.notices())
+
+    try:
+        await px4.start()
+        first.stop()
+        await until(lambda: (Level.ERROR, "autopilot: the link to PX4 is lost: no heartbeat") in told, listen)
+        stale = px4.latest()
+        px4.command(command())  # survives
+        second = Px4StandIn(World(VEHICLE), bind=("127.0.0.1", port))
+        second.start()
+        try:
+            await until(lambda: (Level.WARNING, "autopilot: the link to PX4 is back") in told, listen)
+            fresh = px4.latest()
+            assert stale is not None
+            assert fresh is not None
+            await until(lambda: px4.counts()["ATTITUDE_QUATERNION"].rate > 200.0)
+            assert second._intervals[31] == pytest.approx(0.004)
+        finally:
+            await px4.stop()
+            second.stop()
+    finally:
+        await px4.stop()
+        first.stop()
+
+
+async def test_start_again_after_stop(pair: tuple[Px4, Px4StandIn]) -> None:
+    px4, _ = pair
+    await px4.stop()
+    await px4.stop()
+    with pytest.raises(DeviceError, match="after stop"):
+        px4.command(command())
+    await px4.start()
+    assert px4.latest() is not None
+
+
+async def test_a_number_that_is_not_finite_is_rejected(pair: tuple[Px4, Px4StandIn]) -> None:
+    px4, stand_in = pair
+    make = stand_in._makers[31]
+
+    def broken() -> object:
+        message = make()
+        message.q1 = nan
+        return message
+
+    stand_in._makers[31] = broken
+    await until(lambda: px4.counts()["ATTITUDE_QUATERNION"].rejected > 10)
+    latest = px4.latest()
+    assert latest is not None
+    assert latest.q_WB == pytest.approx(LEVEL, abs=1e-3)
+
+
+async def test_long_status_texts_are_joined(pair: tuple[Px4, Px4StandIn]) -> None:
+    px4, stand_in = pair
+    text = "".join(chr(97 + i % 26) for i in range(130))
+    stand_in._say(4, text)
+    told: list[tuple[Level, str]] = []
+    await until(lambda: bool(told), lambda: told.extend((n.level, n.text) for n in px4.notices() if "abc" in n.text))
+    assert told == [(Level.WARNING, f"PX4: {text}")]
