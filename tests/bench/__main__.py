@@ -1,0 +1,51 @@
+"""``python -m tests.bench``: fly a mission, measure, print one table, write the same as JSON."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from onboard.config import load_config
+from onboard.layers import ConfigError
+from tests.bench import compare, core, flight
+from tests.bench.report import Report, conditions
+from tests.bench.table import table
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit code 0, or 2 for a wrong input."""
+    parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
+    parser.add_argument("--json", type=Path, default=Path("build/bench.json"), help="where to write the figures")
+    parser.add_argument("--law", help="parameter set of the controllers")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="set a parameter")
+    parser.add_argument("--longest", type=float, metavar="S", help="break the mission off after S simulated seconds")
+    given = parser.parse_args(arguments)
+    if given.longest is not None and not 1.0 <= given.longest <= 900.0:
+        parser.error(f"--longest {given.longest:g}: from 1 to 900 s")
+    try:
+        config = load_config(law=given.law, sets=given.set)
+        given.json.parent.mkdir(parents=True, exist_ok=True)
+        given.json.open("ab").close()
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"--json {given.json}: cannot be written ({error.strerror})", file=sys.stderr)
+        return 2
+    before = conditions(f"scenario {config.scenario}, law {config.law}, interface {config.interface.value}")
+    flown, ticks = flight.fly(config, given.longest)
+    stepped = core.measure(ticks, config)
+    before["interrupted"] = f"{stepped.interruptions} times while the core was measured"
+    report = Report(before, stepped, flown, compare.compare(config.fuzzy, config.vehicle))
+    given.json.write_bytes(msgspec.json.format(msgspec.json.encode(report)) + b"\n")
+    print(table(report))
+    print(f"\nThe same as JSON: {given.json}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

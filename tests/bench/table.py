@@ -1,0 +1,95 @@
+"""The figures as one table in plain text, at most 100 columns wide."""
+
+from __future__ import annotations
+
+from tests.bench.core import Part
+from tests.bench.measure import Stat
+from tests.bench.report import TARGET_US, Report
+
+WIDTH = 100
+_NAME, _BAR = 32, 30
+_EIGHTHS = " ▏▎▍▌▋▊▉"
+
+
+def table(report: Report) -> str:
+    """All of a report, section by section."""
+    return "\n".join([*_conditions(report), *_core(report), *_flight(report), *_comparisons(report)])
+
+
+def _head(title: str, *columns: str) -> list[str]:
+    return ["", f"{title:<{_NAME}}" + "".join(f"{column:>11}" for column in columns), "─" * WIDTH]
+
+
+def _line(name: str, time: Stat, more: str = "") -> str:
+    return f"{name:<{_NAME}}{time.median:>11.2f}{time.p99:>11.2f}{more}".rstrip()
+
+
+def _bar(share: float) -> str:
+    eighths = round(share * _BAR * 8)
+    return "█" * (eighths // 8) + _EIGHTHS[eighths % 8]
+
+
+def _conditions(report: Report) -> list[str]:
+    return [f"{name + ':':<13}{value}" for name, value in report.conditions.items()]
+
+
+def _core(report: Report) -> list[str]:
+    core = report.core
+    verdict = "met" if core.step.median <= TARGET_US else "MISSED"
+    lines = _head(f"Core step, {core.step.count} recorded ticks", "median us", "p99 us", "share")
+    lines.append(_line("whole step", core.step, f"{'100 %':>11}   target {TARGET_US} us: {verdict}"))
+
+    def show(part: Part, indent: int) -> None:
+        name = "  " * indent + part.name
+        bar = _bar(part.share) if indent == 1 else ""
+        lines.append(_line(name, part.time, f"{100.0 * part.share:>9.1f} %   {bar}"))
+        for inside in part.inside:
+            show(inside, indent + 1)
+
+    for part in core.parts:
+        show(part, 1)
+    rest = 1.0 - sum(part.share for part in core.parts)
+    lines.append(f"{'  the step itself':<{_NAME}}{'':>22}{100.0 * rest:>9.1f} %   {_bar(max(0.0, rest))}".rstrip())
+    return lines
+
+
+def _flight(report: Report) -> list[str]:
+    f = report.flight
+    lines = _head(f"Mission, {f.sim_s:.1f} s to {f.ended_in}", "median us", "p99 us", "of wall")
+
+    def share(seconds: float) -> str:
+        return f"{100.0 * seconds / f.wall_s:>9.1f} %   "
+
+    lines.append(_line("core step, in the loop", f.core, share(f.core_s)))
+    lines.append(
+        _line(
+            f"world, a tick of {f.steps_per_tick} steps",
+            f.world,
+            share(f.world_s) + f"{f.steps_per_s:,.0f} steps/s, {f.speed:.0f} x real time",
+        )
+    )
+    lines.append(
+        _line(
+            "recorder, a tick",
+            f.recorder,
+            share(f.recorder_s) + f"{f.log_bytes / f.sim_s / 1000.0:.1f} kB a second",
+        )
+    )
+    rest = f.wall_s - f.core_s - f.world_s - f.recorder_s
+    lines.append(f"{'loop, devices, clock':<{_NAME}}{'':>22}" + share(rest).rstrip())
+    whole = f"{f.wall_s:.2f} s of wall time for {f.sim_s:.1f} s simulated"
+    lines.append(f"{'whole mission':<{_NAME}}{whole}: {f.sim_s / f.wall_s:.1f} times real time")
+    return lines
+
+
+def _comparisons(report: Report) -> list[str]:
+    lines = _head("Beside other packages", "median us", "p99 us", "ratio")
+    for row in report.comparisons:
+        if row.ours is None or row.theirs is None:
+            lines.append(f"{row.name:<{_NAME}}{row.package}")
+            continue
+        if not any(line.startswith(f"{row.name}, ours") for line in lines):
+            lines.append(_line(f"{row.name}, ours", row.ours, f"{1.0:>11.1f}"))
+        lines.append(_line(f"  {row.package}", row.theirs, f"{row.ratio:>11.1f}   results {row.difference:.1g} apart"))
+        lines.append(f"    ({row.note})")
+    return lines

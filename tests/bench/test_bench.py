@@ -1,0 +1,53 @@
+"""The bench itself, on the first seconds of a mission: no figure is judged, only that they belong together."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.bench.__main__ import main
+from tests.bench.table import WIDTH
+
+
+@pytest.mark.filterwarnings("ignore:Passing more than 2:DeprecationWarning")  # scikit-fuzzy with a new NumPy
+def test_a_short_run_fills_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "new" / "bench.json"
+    assert main(["--longest", "4", "--json", str(out)]) == 0
+    report = json.loads(out.read_text("utf-8"))
+    core, flight = report["core"], report["flight"]
+    assert core["step"]["count"] == 1001
+    assert 0.5 < sum(part["share"] for part in core["parts"]) < 1.5
+    for part in core["parts"]:
+        assert part["time"]["median"] < core["step"]["median"]
+        assert sum(inside["share"] for inside in part["inside"]) < part["share"] + 0.1
+    assert flight["core_s"] + flight["world_s"] + flight["recorder_s"] < flight["wall_s"]
+    assert flight["sim_s"] == pytest.approx(4.0)
+    assert flight["log_bytes"] > 100_000
+    for row in report["comparisons"]:
+        assert row["ratio"] is None or row["difference"] < 0.01, row["package"]
+
+    text = capsys.readouterr().out
+    assert max(map(len, text.split("\nThe same")[0].splitlines())) <= WIDTH
+    for name in ("whole step", "dynamics", "limits", "recorder", "fuzzy law", "mass matrix"):
+        assert name in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--longest", "0"], "from 1 to 900 s"),
+        (["--json", "{here}"], "cannot be written"),
+        (["--set", "no.such=1"], "no.such"),
+    ],
+)
+def test_wrong_input(arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = [text.format(here=tmp_path) for text in arguments]
+    json_at = [] if "--json" in given else ["--json", str(tmp_path / "bench.json")]
+    try:
+        code = main([*given, *json_at])
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    assert code == 2
+    assert words in capsys.readouterr().err
