@@ -3,35 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 from typing import ParamSpec, TypeVar, cast
 
-from numba import njit
+from numba import config, njit
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-
-def _drop_stale_cache() -> None:
-    """Remove compiled kernels that are older than any source file here.
-
-    Numba looks only at the file of the outermost function, so that after an edit of a callee in another file it
-    would go on running the old one.
-    """
-    here = Path(__file__).parent
-    newest = max(source.stat().st_mtime for source in here.glob("*.py"))
-    for index in (here / "__pycache__").glob("*.nbi"):
-        try:
-            if index.stat().st_mtime < newest:
-                index.unlink()
-        except OSError:  # Another process was faster, or the folder is read-only and holds no cache that we wrote.
-            continue
-
-
-_drop_stale_cache()
+_HERE = Path(__file__).parent
+_TEXTS = [source.read_bytes() for source in sorted(_HERE.glob("*.py"))]
+_SOURCES = sha256(b"".join(text for text in _TEXTS if b"@compiled" in text or b"compile-time" in text)).hexdigest()
+_CACHE = str(_HERE / "__pycache__" / f"kernels-{_SOURCES[:16]}")
 
 
 def compiled(signature: str | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator: compile for this numba signature, at import or from the cache; without one, where it is called."""
-    decorate = njit(cache=True) if signature is None else njit(signature, cache=True)
-    return cast(Callable[[Callable[P, R]], Callable[P, R]], decorate)
+    """Decorator: compile for this numba signature, at import or from the cache; without one, where it is called.
+
+    Numba takes a cached kernel for fresh while the file of its outermost function is unchanged, and would go on
+    running the old callees after an edit in another file. So each state of the kernels' sources has a cache of its own.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        elsewhere = config.CACHE_DIR  # type: ignore[attr-defined]
+        config.CACHE_DIR = _CACHE  # type: ignore[attr-defined]
+        try:
+            wrap = njit(cache=True) if signature is None else njit(signature, cache=True)
+            return cast(Callable[P, R], wrap(function))
+        finally:
+            config.CACHE_DIR = elsewhere  # type: ignore[attr-defined]
+
+    return decorate

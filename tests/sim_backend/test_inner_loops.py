@@ -139,8 +139,9 @@ def test_the_rate_loop_has_its_bandwidth(vehicle: Vehicle) -> None:
     for bandwidth in (25.0, 40.0):
         params = WorldParams(loops=LoopParams(bandwidth=bandwidth), autopilot=autopilot)
         world = aloft(vehicle, params)
-        fly(world, SetPoint(Interface.BODY_RATE, weight, w_WB_B=(0.0, 0.5, 0.0)), 1.0 / bandwidth)
-        assert world.truth().w_WB_B[1] == pytest.approx(0.5 * (1.0 - np.exp(-1.0)), rel=0.12)
+        fly(world, SetPoint(Interface.BODY_RATE, weight, w_WB_B=(0.5, 0.0, 0.0)), 1.0 / bandwidth)
+        # About roll, where the joints' springs do not give way.
+        assert world.truth().w_WB_B[0] == pytest.approx(0.5 * (1.0 - np.exp(-1.0)), rel=0.12)
 
 
 def test_attitude_and_rates_are_reached(vehicle: Vehicle) -> None:
