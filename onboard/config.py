@@ -1,6 +1,7 @@
 """The whole configuration of a run, composed from the files in ``configs/`` and the command line.
 
-Later layers win: ``vehicle.yaml`` (as ``vehicle``), ``controllers/<law>.yaml``, the scenario, ``--set``, ``--seed``.
+Later layers win: ``vehicle.yaml`` (as ``vehicle``), ``controllers/<law>.yaml``, ``interfaces/<interface>.yaml`` (gains
+are chosen for what the autopilot is sent), the scenario, ``--set``, ``--seed``.
 """
 
 from __future__ import annotations
@@ -69,9 +70,11 @@ def load_config(
         given, origin = ("tuned", "default law") if law is None else (law, f"--law {law}")
         if law is None and scene and "law" in scene.values:
             given, origin = scene.values["law"], scene.source
+        controller = attempt(_controller, given, origin, directory)
         layers = [
             attempt(_vehicle, directory),
-            attempt(_controller, given, origin, directory),
+            controller,
+            attempt(_interface, [controller, scene, *options], directory),
             scene,
             Layer("--scenario", {"scenario": scenario}),
             Layer("--law", {"law": given}),
@@ -114,6 +117,13 @@ def _scenario(scenario: str, directory: Path) -> Layer:
 
 def _controller(law: Any, origin: str, directory: Path) -> Layer:
     return _named("law", law, origin, directory / "controllers")
+
+
+def _interface(layers: Sequence[Layer | None], directory: Path) -> Layer | None:
+    """What differs for the interface that the last of ``layers`` to name one asks for; None when nothing does."""
+    asked = [layer.values["interface"] for layer in layers if layer and "interface" in layer.values]
+    path = directory / "interfaces" / f"{asked[-1]}.yaml" if asked else None
+    return read_yaml(path, _shown(path)) if path and path.is_file() else None
 
 
 def _vehicle(directory: Path) -> Layer:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Struct
 
-from drivers.samples import Vec3
+from drivers.samples import Interface, Vec3
 from onboard.core import backstepping, compensation, kinematics, math3, sliding_mode, tilt
 from onboard.core.derived import Derived
 from onboard.core.spec import note, spec
@@ -106,10 +106,12 @@ def step(
         joint_rates[1] - target_rate[1],
         joint_rates[2] - target_rate[2],
     )
+    own_attitude = params.interface is Interface.WRENCH
     sliding, angular, adapted = sliding_mode.step(
         state.sliding,
-        error,
-        error_rate,
+        # the autopilot's own loops hold the attitude: then the joints' torques must not answer to our law's wishes
+        error if own_attitude else (0.0, 0.0, 0.0, *error[3:]),
+        error_rate if own_attitude else (0.0, 0.0, 0.0, *error_rate[3:]),
         (roll_acceleration, pitch_acceleration, reference.yaw_acceleration, *joint_acceleration),
         flying,
         params.sliding_mode,

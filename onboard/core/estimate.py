@@ -1,7 +1,8 @@
 """From samples to what the core believes: body, joints, tip, contact force, and how old it all is.
 
 Attitude, angular velocity and specific force come from the autopilot, position and velocity from odometry,
-joints from the servos. A sample that is not finite is not used: its device falls silent, and its age tells.
+joints from the servos. A sample that is not finite, or a pose that repeats the one before, is not used: its device
+falls silent, and its age tells. When the tracker jumps, the vehicle has not: its position goes on where it was.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from onboard.core.params import Params as AllParams
 
 NEAR_PIPE = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE)
+ON_GROUND = (Phase.PREFLIGHT, Phase.STOPPED)
 
 
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
@@ -49,6 +51,8 @@ class State(Struct, frozen=True, gc=False):
     """The tracker's reset counter has changed with the newest sample."""
     disagreement: float = 0.0
     """Angle between the verticals of odometry and autopilot, rad."""
+    shift: Vec3 = (0.0, 0.0, 0.0)
+    """What takes a position of the tracker back into the frame it had before it jumped, m."""
 
 
 def step(
@@ -67,14 +71,20 @@ def step(
     jump, reset, disagreement = 0.0, False, state.disagreement
     odometry, autopilot, servos = state.odometry, state.autopilot, state.servos
     new = inputs.odometry
+    shift = state.shift if phase is not Phase.PREFLIGHT else _O
     if new is not None and (odometry is None or new.t_ns != odometry.t_ns):
-        if _finite(new.p_WB, new.v_WB, new.q_WB):
-            if odometry is not None:
-                jump = _jump(odometry, new)
-                reset = new.reset_counter != odometry.reset_counter
-            odometry = new
-        else:
+        if not _finite(new.p_WB, new.v_WB, new.q_WB):
             finite = False
+        elif odometry is None:
+            odometry = new
+        elif phase in ON_GROUND or not _repeats(odometry, new):
+            leap = _leap(odometry, new)
+            jump = hypot(*leap)
+            reset = new.reset_counter != odometry.reset_counter
+            brief = new.t_ns - odometry.t_ns <= params.estimate.extrapolate_max * 1e9
+            if brief and (reset or jump > params.safety.odometry_jump):
+                shift = (shift[0] - leap[0], shift[1] - leap[1], shift[2] - leap[2])
+            odometry = new
     told = inputs.autopilot
     if told is not None:
         if _finite(told.q_WB, told.w_WB_B, told.f_B):
@@ -97,8 +107,9 @@ def step(
     if odometry is None or autopilot is None or servos is None:
         estimate = _nothing(state.payload, ages)
         waiting = State(
-            odometry, autopilot, servos, state.observer, state.trigger, state.payload, finite, jump, reset, disagreement
-        )
+            odometry, autopilot, servos, state.observer, state.trigger, state.payload,
+            finite, jump, reset, disagreement, shift,
+        )  # fmt: skip
         return waiting, estimate
 
     vehicle, site = params.vehicle, derived.site
@@ -110,9 +121,9 @@ def step(
     v = odometry.v_WB
     ahead = min(max(0.0, ages[0]), params.estimate.extrapolate_max)
     p = (
-        odometry.p_WB[0] + ahead * v[0],
-        odometry.p_WB[1] + ahead * v[1],
-        odometry.p_WB[2] + ahead * v[2],
+        odometry.p_WB[0] + shift[0] + ahead * v[0],
+        odometry.p_WB[1] + shift[1] + ahead * v[1],
+        odometry.p_WB[2] + shift[2] + ahead * v[2],
     )
     joints, rates = servos.position[:3], servos.velocity[:3]
     payload = state.payload and not (phase is Phase.RELEASE and servos.position[4] > params.estimate.released_at)
@@ -147,7 +158,9 @@ def step(
     if state.odometry is None or odometry.t_ns != state.odometry.t_ns:
         x, y, z = math3.vertical(odometry.q_WB)
         disagreement = acos(min(1.0, max(-1.0, x * R[6] + y * R[7] + z * R[8])))
-    return State(odometry, autopilot, servos, watched, trigger, payload, finite, jump, reset, disagreement), estimate
+    return State(
+        odometry, autopilot, servos, watched, trigger, payload, finite, jump, reset, disagreement, shift
+    ), estimate
 
 
 def _finite(*groups: tuple[float, ...]) -> bool:
@@ -157,11 +170,16 @@ def _finite(*groups: tuple[float, ...]) -> bool:
     return total - total == 0.0
 
 
-def _jump(before: Odometry, after: Odometry) -> float:
-    """Distance (m) between the new position and the one that the mean velocity leads to."""
+def _repeats(before: Odometry, after: Odometry) -> bool:
+    """A new stamp on the same pose, to the bit: the tracker hangs, so its age must tell."""
+    return before.p_WB == after.p_WB and before.v_WB == after.v_WB and before.q_WB == after.q_WB
+
+
+def _leap(before: Odometry, after: Odometry) -> Vec3:
+    """From the position that the mean velocity leads to, to the new one, m."""
     time = (after.t_ns - before.t_ns) * 1e-9
     a, b, u, v = before.p_WB, after.p_WB, before.v_WB, after.v_WB
-    return hypot(
+    return (
         b[0] - a[0] - 0.5 * time * (u[0] + v[0]),
         b[1] - a[1] - 0.5 * time * (u[1] + v[1]),
         b[2] - a[2] - 0.5 * time * (u[2] + v[2]),

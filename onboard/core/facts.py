@@ -22,12 +22,16 @@ _CONTACT = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE, Phase.RETREAT, Phase.RETR
 _NO_POSITION = (0.0, 0.0, 0.0)
 
 
-def airborne(before: bool, seen: estimating.State, believed: Estimate, home_height: float, lift: float) -> bool:
+def airborne(
+    before: bool, seen: estimating.State, believed: Estimate, phase: Phase, home_height: float, lift: float
+) -> bool:
     """Whether the vehicle is off the ground: it has risen with its motors on, and has not landed since."""
     told = seen.autopilot
     if told is None or not told.armed:
-        # a report of "disarmed" in the air must not hide that the vehicle is there
-        return before and believed.p_WB[2] > home_height + LIFT_OFF
+        # a report of "disarmed" in the air must not hide that the vehicle is there; but where it should come down,
+        # the autopilot's word ends the landing, since the position may be what was lost
+        down = phase is Phase.LAND and told is not None and told.landed is Landed.ON_GROUND
+        return before and not down and believed.p_WB[2] > home_height + LIFT_OFF
     if before:
         return not (lift < 1.0 and told.landed is Landed.ON_GROUND)
     return lift > 0.5 and believed.p_WB[2] > home_height + LIFT_OFF
@@ -91,11 +95,12 @@ def for_mission(
     site = derived.site
     crack, tip, n = site.crack, believed.tip_W, site.normal
     beyond = (tip[0] - crack[0]) * n[0] + (tip[1] - crack[1]) * n[1]
+    adrift = believed.age_autopilot > params.safety.autopilot_lost
     return mission.Facts(
         ready=believed.valid and grounded and not armed and not verdict.reasons,
         engaged=armed and told is not None and told.mode is FlightMode.OFFBOARD,
         airborne=flying,
-        arrived=progress.arrived,
+        arrived=progress.arrived or adrift,  # without attitude no motion is flown to its end
         triggered=believed.in_contact,
         pressed=progress.pressed,
         released=progress.released,

@@ -243,7 +243,9 @@ def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived:
         state = replace(state, press_time=0.0, press_start=push, admittance=admittance.State())
         force = push
     elif phase is not Phase.RELEASE:
-        if before in PRESSING and phase in BACKING_OUT:
+        if phase in BACKING_OUT and state.easing >= 0.0:
+            easing = state.easing  # one retreat turns into another: the force goes on being taken back
+        elif phase in BACKING_OUT and before in PRESSING:
             easing = 0.0
             state = replace(state, press_start=force)
         elif before in PRESSING or state.easing >= 0.0:

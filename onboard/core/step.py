@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from drivers.samples import Engage
+from drivers.samples import Engage, JointMode
 from onboard.core import actuation, control, estimate, facts, guidance, limits, mission, safety
 from onboard.core.derived import derive
 from onboard.core.params import Params
@@ -46,7 +46,7 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
     seen, believed = estimate.step(
         state.estimate, inputs, before, state.progress, state.reference, state.thrust, derived, params, dt
     )
-    flying = facts.airborne(state.airborne, seen, believed, state.guidance.home[2], lift)
+    flying = facts.airborne(state.airborne, seen, believed, before, state.guidance.home[2], lift)
     dangers = facts.for_safety(
         seen, believed, inputs, before, flying, state.engaged, state.reference, state.control.compensation
     )
@@ -62,7 +62,9 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
     )  # fmt: skip
     engage = mission.engage(task, known)
     autopilot = actuation.autopilot_command(wanted, engage, params.interface)
-    servos = actuation.servo_command(wanted, reference, params.joints, params.joint_current)
+    # torques for joints that are not seen any more would fling the arm: the servos hold it by themselves
+    joints = params.joints if believed.age_servos <= params.safety.servos_late else JointMode.POSITION
+    servos = actuation.servo_command(wanted, reference, joints, params.joint_current)
     gate, autopilot, servos, clipped = limits.step(
         state.limits, autopilot, servos, facts.permission(task.phase, engage, believed, flying and reference.lift >= 1.0),
         facts.measured(seen), derived.bounds, dt,
