@@ -44,7 +44,7 @@ class PlantParams(Struct, frozen=True, forbid_unknown_fields=True):
 
     step: Annotated[float, knob("s", "physics step", 1e-5, 2e-4)] = 1e-4
     ideal_motors: Annotated[bool, switch("no thrust lag, full thrust at any battery voltage")] = True
-    ideal_servos: Annotated[bool, switch("no gear friction, exact position, current proportional to torque")] = True
+    ideal_servos: Annotated[bool, switch("no gear friction, current proportional to torque")] = True
     tool_servo_time: Annotated[float, knob("s", "time constant of the pump and gripper servos", 0.005, 1.0)] = 0.04
     friction_speed: Annotated[
         float, knob("rad/s", "joint speed below which gear friction is regularised", 1e-4, 1.0)

@@ -183,6 +183,14 @@ def test_contact_is_the_same_at_any_heading(vehicle: Vehicle, heading: float) ->
     assert plant.truth().contact_W == pytest.approx(turned, rel=1e-6)
 
 
+@pytest.mark.parametrize(("beside", "touches"), [(0.0, True), (0.99, True), (-1.01, False), (1.01, False)])
+def test_the_pipe_has_two_ends(vehicle: Vehicle, beside: float, touches: bool) -> None:
+    plant = plant_at(vehicle, PlantParams(), gap=-1e-4)
+    plant.x[at.POSITION + 1] += beside
+    advance(plant.x, plant.p, plant.u, 1)
+    assert (plant.x[at.CONTACT_FORCE] > 0.0) is touches
+
+
 def test_the_contact_only_pushes(vehicle: Vehicle) -> None:
     plant = plant_at(vehicle, PlantParams(), gap=-1e-5, velocity=(-0.5, 0.0, 0.0))
     advance(plant.x, plant.p, plant.u, 1)

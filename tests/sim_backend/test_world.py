@@ -85,6 +85,20 @@ def test_every_interface_takes_off_and_hovers(vehicle: Vehicle, interface: Inter
     assert state(hand) == (True, FlightMode.OFFBOARD, Landed.IN_AIR)
 
 
+@pytest.mark.parametrize("interface", list(Interface))
+def test_it_flies_with_nothing_ideal(vehicle: Vehicle, interface: Interface) -> None:
+    plant = PlantParams(ideal_motors=False, ideal_servos=False)
+    world = World(vehicle, WorldParams(plant=plant, sensors=SensorParams(ideal=False)), seed=2)
+    # The first samples are still on their way.
+    world.advance(0.04)
+    hand = Hand(world, interface)
+    hand.fly(UP, 8.0)
+    truth = world.truth()
+    assert truth.p_WB[2] == pytest.approx(1.0, abs=0.05)
+    assert truth.v_WB == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
+    assert truth.crashed == ""
+
+
 def test_it_arms_after_a_stream_of_set_points(hand: Hand) -> None:
     assert state(hand) == (False, FlightMode.HOLD, Landed.ON_GROUND)
     engage(hand, Engage.OFFBOARD, 0.496)
