@@ -38,6 +38,7 @@ STATES = tuple(PAPER["state_rmse"])
 BOUNCE_GAP = 0.010
 _LANDING = (Phase.LAND, Phase.RETREAT_LAND)
 _GROUNDED = (Phase.PREFLIGHT, Phase.STOPPED)
+_HOLDING = (Phase.HOLD, Phase.RETREAT_HOLD)
 _IN_CONTACT = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE)
 
 
@@ -82,6 +83,18 @@ def write(metrics: dict[str, Any], path: Path) -> None:
     path.write_bytes(msgspec.json.format(msgspec.json.encode(metrics), indent=2) + b"\n")
 
 
+def former_wall_s(path: Path) -> float | None:
+    """Duration of the run on the wall clock as a ``metrics.json`` tells it, where there is one."""
+
+    class Former(msgspec.Struct):
+        wall_s: float | None = None
+
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Former).wall_s
+    except (OSError, msgspec.DecodeError):
+        return None
+
+
 def windows(run: Run) -> Windows:
     """Find flight and contact in a run."""
     n = len(run.t)
@@ -112,8 +125,8 @@ def phases(run: Run) -> list[dict[str, Any]]:
 def outcome(run: Run) -> str:
     """How the run ended.
 
-    "completed": sleeve installed and landed as planned; "safe": not that, but nothing was harmed; "lost": the vehicle
-    crashed or its motors were cut in the air; "unfinished": the log ends before the run did.
+    "completed": sleeve installed and landed as planned; "safe": not that, but on the ground or holding unharmed;
+    "lost": the vehicle crashed or its motors were cut in the air; "unfinished": broken off in the middle.
     """
     truth = run.truth
     grounded = truth.on_ground if truth is not None else run.landed == "on_ground"
@@ -121,7 +134,7 @@ def outcome(run: Run) -> str:
         return "lost"
     if run.phase[-1] == Phase.STOPPED and not grounded:
         return "lost"
-    if not run.complete:
+    if not run.complete or not (grounded or run.phase[-1] in _HOLDING):
         return "unfinished"
     installed = truth.sleeve_on_pipe if truth is not None else bool(run.payload[0]) and not bool(run.payload[-1])
     order = [phase["name"] for phase in phases(run)]

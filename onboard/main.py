@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from onboard.config import Config, dump_config, load_config
-from onboard.core.plan import Infeasible
+from onboard.core.plan import InfeasibleError
 from onboard.core.types import Outputs, Phase
 from onboard.layers import ConfigError
 
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _replay(options)
     except ConfigError as error:
         print(error, file=sys.stderr)
-    except Infeasible as error:
+    except InfeasibleError as error:
         print(f"this mission cannot be flown: {error}", file=sys.stderr)
     return WRONG_INPUT
 
@@ -89,6 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     replay = commands.add_parser("replay", help="run a log's inputs through the core again and compare to the bit")
     replay.add_argument("log", type=Path)
     replay.add_argument("--from", type=float, dest="start", metavar="SECONDS")
+    replay.add_argument("--partial", action="store_true")
     return parser
 
 
@@ -120,7 +121,7 @@ def _replay(options: argparse.Namespace) -> int:
     from onboard.replay import replay
 
     try:
-        result = replay(options.log, options.start)
+        result = replay(options.log, options.start, partial=options.partial)
     except LogError as error:
         print(error, file=sys.stderr)
         return WRONG_INPUT

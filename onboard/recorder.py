@@ -66,7 +66,7 @@ class Recorder:
     A killed process loses at most the last quarter of a second.
 
     Args:
-        path: the file, which must not exist yet.
+        path: the file; an older one is replaced.
         info: what the run is.
         config: the parameter set in force at the start.
         config_yaml: the same as text, for people.
@@ -75,7 +75,7 @@ class Recorder:
         background: encode and write in a thread.
 
     Raises:
-        OSError: the file cannot be created (``FileExistsError`` when it exists).
+        OSError: the file cannot be created.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Recorder:
         """Records lost to a full queue or a failed disk (background only)."""
         self.error: Exception | None = None
         """Why the background writer gave up."""
-        self._stream = path.open("xb")
+        self._stream = path.open("wb")
         self._writer = McapWriter(self._stream, f"pipewright {info.version}")
         self._channels: dict[str, Channel] = {}
         self._ticks = self._writer.channel(TICK, Tick)

@@ -68,10 +68,11 @@ def test_equal_runs_give_equal_bytes(tmp_path: Path) -> None:
     assert record(tmp_path / "a" / "log.mcap").read_bytes() == record(tmp_path / "other.mcap").read_bytes()
 
 
-def test_existing_file_is_not_overwritten(tmp_path: Path) -> None:
-    path = record(tmp_path / "log.mcap", CYCLES[:1])
-    with pytest.raises(FileExistsError):
-        record(path, CYCLES[:1])
+def test_older_file_is_replaced(tmp_path: Path) -> None:
+    path = record(tmp_path / "log.mcap", CYCLES[:50])
+    record(path, CYCLES[:1])
+    with LogReader(path) as log:
+        assert [tick.index for tick in log.ticks()] == [0]
 
 
 def test_what_was_written_before_a_kill_can_be_read(tmp_path: Path) -> None:

@@ -1,0 +1,151 @@
+"""``report.html``: one page, complete in itself, that shows what happened in a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from groundstation import figures, table
+from groundstation.run import Run
+from groundstation.svg import Chart
+from onboard.messages import Severity
+
+_HERE = Path(__file__).parent
+_BADGES = {
+    "completed": ("good", "✓ completed"),
+    "safe": ("warn", "△ ended safely, not completed"),
+    "unfinished": ("warn", "△ broken off"),
+    "lost": ("bad", "✗ vehicle lost"),
+}
+
+
+def write(run: Run, metrics: dict[str, Any], path: Path) -> None:
+    """Write the report of a run; ``metrics`` is what ``metrics.compute`` gave for it."""
+    path.write_text("".join(_page(run, metrics)), encoding="utf-8")
+
+
+def _page(run: Run, metrics: dict[str, Any]) -> Iterator[str]:
+    info = run.info
+    title = f"Pipe repair: {info.scenario}, {info.law}, seed {info.seed}"
+    kind, words = _BADGES[metrics["outcome"]]
+    yield '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+    yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    yield f"<title>{escape(title)}</title><style>{(_HERE / 'report.css').read_text(encoding='utf-8')}</style></head>"
+    yield f'<body><main><header><h1>Pipe repair</h1><span class="badge {kind}">{words}</span></header>'
+    yield f'<p class="soft">{_summary(run, metrics)}</p>'
+    yield from _cards(run, metrics)
+    yield "<h2>Phases</h2>"
+    yield figures.timeline(run)
+    yield from _table(metrics)
+    note = "The shaded stretch is the contact, from trigger to release. Point at a chart to read values."
+    yield from _figure("Tracking in contact (figure 5)", note, figures.tracking(run), pair=True)
+    yield from _figure(
+        "Force estimate (figure 6)", "Compression of the pipe is positive.", figures.estimation(run), pair=False
+    )
+    note = "What the rotors and the servos really gave, over the whole run."
+    yield from _figure("Actuation (figure 7)", note, figures.actuation(run), pair=False)
+    note = "The drawing is to scale, with the vehicle to the left; the broken circle is the needle's path."
+    yield from _figure("At the pipe", note, figures.at_the_pipe(run), pair=True)
+    yield from _timing(run, metrics)
+    yield from _events(run)
+    yield "<h2>Configuration</h2><details><summary>all that was in force at the start</summary>"
+    yield f"<pre>{escape(run.config_yaml)}</pre></details>"
+    yield f"<footer>Pipewright {escape(info.version)}</footer></main>"
+    yield f"<script>{(_HERE / 'report.js').read_text(encoding='utf-8')}</script></body></html>\n"
+
+
+def _summary(run: Run, metrics: dict[str, Any]) -> str:
+    info, pipe = run.info, run.config.pipe
+    world = "real time" if info.realtime else "simulated"
+    took = f" in {metrics['wall_s']:.1f} s of wall clock" if metrics["wall_s"] is not None and not info.realtime else ""
+    begun = f", begun {info.started}" if info.started else ""
+    text = (
+        f"Scenario {info.scenario}, law {info.law}, seed {info.seed}; {metrics['sim_s']:.1f} s {world}{took}{begun}. "
+        f"Pipe of radius {1000 * pipe.radius:g} mm at ({', '.join(f'{v:g}' for v in pipe.position)}) m, "
+        f"heading {pipe.heading_deg:g}°; set force {run.config.repair.force:g} N."
+    )
+    return escape(text)
+
+
+def _cards(run: Run, metrics: dict[str, Any]) -> Iterator[str]:
+    yield '<div class="cards">'
+    for row in table.rows(metrics)[:3]:
+        if row.value is not None:
+            yield _card(f"{row.value:.4f} N", f"{row.label}, RMSE (paper {row.paper:g} N)", row.better)
+    for figure in table.figures(metrics, run.config.repair.force):
+        label = f"{figure.label} ({figure.detail})" if figure.detail else figure.label
+        yield _card(figure.value, label, figure.good)
+    yield "</div>"
+
+
+def _card(value: str, label: str, good: bool | None) -> str:
+    kind = {True: ' class="good"', False: ' class="bad"', None: ""}[good]
+    mark = {True: " ✓", False: " ✗", None: ""}[good]
+    return f'<div class="card"><b{kind}>{escape(value)}{mark}</b><span>{escape(label)}</span></div>'
+
+
+def _table(metrics: dict[str, Any]) -> Iterator[str]:
+    yield "<h2>Table II, side by side</h2>"
+    yield (
+        '<p class="note">Root mean square errors: forces from trigger to release; states against the reference '
+        "that the loop follows, from the end of takeoff to the start of landing, and in contact alone.</p>"
+    )
+    yield '<div class="scroll"><table><tr><th></th><th class="n">paper</th><th class="n">this run</th>'
+    yield '<th class="n">in contact</th><th>unit</th><th>verdict</th></tr>'
+    for i, row in enumerate(table.rows(metrics)):
+        if i in (0, 3):
+            yield f'<tr class="group"><th colspan="6">{"states" if i else "forces"}</th></tr>'
+        value, contact = (f"{v:.5f}" if v is not None else "" for v in (row.value, row.in_contact))
+        mark = {True: '<span class="good">▲ ', False: '<span class="bad">▼ ', None: '<span class="soft">'}[row.better]
+        yield (
+            f'<tr><td>{escape(row.label)}</td><td class="n">{row.paper:.4f}</td><td class="n">{value}</td>'
+            f'<td class="n">{contact}</td><td>{row.unit}</td><td>{mark}{escape(row.verdict)}</span></td></tr>'
+        )
+    yield "</table></div>"
+
+
+def _figure(heading: str, note: str, charts: list[Chart], *, pair: bool) -> Iterator[str]:
+    if charts:
+        yield f'<h2>{escape(heading)}</h2><p class="note">{escape(note)}</p>'
+        yield '<div class="pair">' if pair else "<div>"
+        for chart in charts:
+            yield f"<div{' class=drawing' if chart.equal else ''}>{chart.svg()}</div>"
+        yield "</div>"
+
+
+def _timing(run: Run, metrics: dict[str, Any]) -> Iterator[str]:
+    timing = metrics["timing"]
+    if timing["late"] is None:
+        return
+    headings = "".join(f'<th class="n">{words}</th>' for words in ("rate, Hz", "median, ms", "p99, ms", "max, ms"))
+    yield f"<h2>Punctuality</h2><table><tr><th></th>{headings}</tr>"
+    spreads = {"lateness of the tick": ("tick", timing["late"]), "duration of the tick": ("", timing["busy"])}
+    spreads |= {f"age of {name}": (name, spread) for name, spread in timing["ages"].items()}
+    for label, (rate, spread) in spreads.items():
+        hertz = f"{timing['rates'][rate]:.1f}" if rate else ""
+        cells = "".join(
+            f'<td class="n">{1000 * spread[key]:.2f}</td>' if spread else '<td class="n"></td>'
+            for key in ("median", "p99", "max")
+        )
+        yield f'<tr><td>{escape(label)}</td><td class="n">{hertz}</td>{cells}</tr>'
+    yield "</table>"
+    if timing["missing_ticks"]:
+        yield f'<p class="note">{timing["missing_ticks"]} ticks are missing in the log.</p>'
+    yield '<div class="pair">' + "".join(f"<div>{chart.svg()}</div>" for chart in figures.punctuality(run)) + "</div>"
+
+
+def _events(run: Run) -> Iterator[str]:
+    if not run.events:
+        return
+    marks = {Severity.INFO: "", Severity.WARNING: "△ ", Severity.ERROR: "✗ "}
+    kinds = {Severity.INFO: "", Severity.WARNING: "", Severity.ERROR: ' class="bad"'}
+    yield '<h2>Events</h2><div class="scroll"><table><tr><th class="n">time, s</th><th>code</th><th>what</th></tr>'
+    for event in run.events:
+        time = (event.t_ns - run.start_ns) * 1e-9
+        yield (
+            f'<tr{kinds[event.severity]}><td class="n">{time:.3f}</td><td>{escape(event.code)}</td>'
+            f"<td>{marks[event.severity]}{escape(event.text)}</td></tr>"
+        )
+    yield "</table></div>"

@@ -1,0 +1,62 @@
+"""What a person reads in the terminal after a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from groundstation import table
+from groundstation.run import Run
+from onboard.messages import Severity
+
+_WORDS = {
+    "completed": "[bold green]✓ mission completed[/]",
+    "safe": "[bold yellow]△ ended safely, mission not completed[/]",
+    "unfinished": "[bold yellow]△ the run was broken off[/]",
+    "lost": "[bold red]✗ vehicle lost[/]",
+}
+_MARKS = {True: "[green]✓[/]", False: "[red]✗[/]", None: " "}
+_REASONS = 6
+
+
+def summarize(run: Run, metrics: dict[str, Any], report: Path, console: Console) -> None:
+    """Print outcome, Table II beside the run, the figures of the contact, and where the report is."""
+    wall = metrics["wall_s"]
+    speed = f" in {wall:.1f} s, {metrics['sim_s'] / wall:.0f} times real time" if wall and not run.info.realtime else ""
+    console.print(f"{_WORDS[metrics['outcome']]}, {metrics['sim_s']:.1f} s{speed}")
+    if metrics["outcome"] != "completed":
+        _reasons(run, console)
+    side = Table(
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 2, 0, 0),
+        title="RMSE, beside Table II of the paper",
+        title_justify="left",
+    )
+    for heading in ("", "paper", "this run", "in contact", "unit", "verdict"):
+        side.add_column(heading, justify="right" if heading in ("paper", "this run", "in contact") else "left")
+    for i, row in enumerate(table.rows(metrics)):
+        cells = [f"{value:.5f}" if value is not None else "" for value in (row.value, row.in_contact)]
+        verdict = f"{_MARKS[row.better]} {row.verdict}"
+        side.add_row(row.label, f"{row.paper:.4f}", *cells, row.unit, verdict, end_section=i == 2)
+    console.print(side)
+    others = Table(box=None, show_header=False, pad_edge=False)
+    for figure in table.figures(metrics, run.config.repair.force):
+        others.add_row(figure.label, figure.value, _MARKS[figure.good], figure.detail)
+    console.print(others)
+    console.print(f"\nreport: {report}", soft_wrap=True, highlight=False)
+
+
+def _reasons(run: Run, console: Console) -> None:
+    """The last warnings and errors, and what the world saw of a crash."""
+    loud = [event for event in run.events if event.severity is not Severity.INFO][-_REASONS:]
+    for event in loud:
+        colour = "red" if event.severity is Severity.ERROR else "yellow"
+        time = (event.t_ns - run.start_ns) * 1e-9
+        console.print(f"  [{colour}]{time:8.2f} s  {event.code}[/]: {event.text}", soft_wrap=True, highlight=False)
+    if run.truth is not None and run.truth.crashed:
+        console.print(f"  [red]{run.truth.crashed}[/]", highlight=False)
