@@ -223,9 +223,11 @@ class Px4:
         self._hub: Any = None
         self._direct: Any = None
         self._task: asyncio.Task[None] | None = None
-        self._asking: asyncio.Task[None] | None = None
+        self._asking: set[asyncio.Task[None]] = set()
+        self._tuning: asyncio.Task[None] | None = None
         self._linked = True
         self._intervals_due = False
+        self._slow: set[str] = set()
         self._rates_checked_ns = 0
 
         self._wanted: Engage | None = None
@@ -323,8 +325,8 @@ class Px4:
         if task is not None:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
-        if self._asking is not None:
-            await asyncio.gather(self._asking, return_exceptions=True)
+        # A question that is out cannot be called back; MAVSDK gives up on it after a second or two.
+        await asyncio.gather(*self._asking, return_exceptions=True)
         self._direct = None
         hub, self._hub = self._hub, None
         if hub is not None:
@@ -432,15 +434,18 @@ class Px4:
             self._judge_rates()
             if self._wanted is Engage.KILL:
                 self._work_towards_kill()
-            elif self._asking is None or self._asking.done():
-                if self._intervals_due and self._linked:
-                    self._intervals_due = False
-                    self._begin(self._ask_intervals())
-                elif (ask := self._next_ask()) is not None:
-                    self._begin(self._try(ask))
+            elif (ask := self._next_ask()) is not None:
+                self._begin(self._try(ask))
+            if self._intervals_due and self._linked and (self._tuning is None or self._tuning.done()):
+                self._intervals_due = False
+                self._tuning = self._begin(self._ask_intervals())
 
-    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        self._asking = asyncio.create_task(work, name="px4 ask")
+    def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Do it beside everything else: an answer that is late must not keep the next question back."""
+        task = asyncio.create_task(work, name="px4 ask")
+        self._asking.add(task)
+        task.add_done_callback(self._asking.discard)
+        return task
 
     def _work_towards_kill(self) -> None:
         mode = self._mode.latest()
@@ -512,10 +517,17 @@ class Px4:
         self._rates_checked_ns = now
         for name in ("ATTITUDE_QUATERNION", "HIGHRES_IMU"):
             achieved = self._boxes[name].counts(now).rate
-            if achieved < _RATE_TOLERANCE * self._settings.rate:
-                # A PX4 that has rebooted sends at its default rates.
-                self._intervals_due = True
-                self._refuse(f"{name} comes at {achieved:.0f} Hz, asked for {self._settings.rate:g} Hz; asking again")
+            if achieved >= _RATE_TOLERANCE * self._settings.rate:
+                self._slow.discard(name)
+                continue
+            # A PX4 that has rebooted sends at its default rates.
+            self._intervals_due = True
+            if name not in self._slow:
+                self._slow.add(name)
+                self._tell(
+                    Level.WARNING,
+                    f"{name} comes at {achieved:.0f} Hz, asked for {self._settings.rate:g} Hz; asking again",
+                )
 
     # -- what MAVSDK's thread calls -------------------------------------------------------------------------------
 

@@ -280,3 +280,20 @@ async def test_long_status_texts_are_joined(pair: tuple[Px4, Px4StandIn]) -> Non
     told: list[tuple[Level, str]] = []
     await until(lambda: bool(told), lambda: told.extend((n.level, n.text) for n in px4.notices() if "abc" in n.text))
     assert told == [(Level.WARNING, f"PX4: {text}")]
+
+
+async def test_a_rate_that_has_fallen_is_told_once_and_asked_for_again(pair: tuple[Px4, Px4StandIn]) -> None:
+    """As after a reboot too short to break the link."""
+    px4, stand_in = pair
+    told: list[str] = []
+
+    def listen() -> None:
+        told.extend(n.text for n in px4.notices() if "ATTITUDE_QUATERNION comes at" in n.text)
+
+    await until(lambda: px4.counts()["ATTITUDE_QUATERNION"].rate > 200.0, listen)
+    told.clear()
+    stand_in._intervals[31] = 0.02
+    await until(lambda: bool(told), listen)
+    await until(lambda: stand_in._intervals[31] == pytest.approx(0.004), listen)
+    assert len(told) == 1
+    assert "asked for 250 Hz; asking again" in told[0]
