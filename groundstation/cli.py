@@ -77,14 +77,16 @@ def _parser() -> argparse.ArgumentParser:
             metavar="KEY=VALUE",
             help="set any parameter; may be repeated",
         )
-        fly.add_argument("--seed", help="of everything random in the world (default: 0)")
+        fly.add_argument("--seed", type=int, metavar="N", help="of everything random in the world (default: 0)")
         fly.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         fly.add_argument("--no-progress", action="store_true", help="no progress bar")
         fly.set_defaults(run=_fly, command=name)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")
     replay.add_argument("log", type=Path, metavar="LOG", help=_LOG_HELP)
-    replay.add_argument("--from", dest="start", metavar="SECONDS", help="begin at the last keyframe before this time")
+    replay.add_argument(
+        "--from", dest="start", type=float, metavar="SECONDS", help="begin at the last keyframe before this time"
+    )
     replay.add_argument("--partial", action="store_true", help="accept a log that was cut off")
     replay.set_defaults(run=_replay)
     words = "rebuild metrics.json and report.html of a run from its log alone"
@@ -103,12 +105,18 @@ def _fly(options: argparse.Namespace) -> int:
     arguments += [f"--{name}={value}" for name, value in given.items() if value is not None]
     arguments += [f"--set={item}" for item in options.sets]
     arguments += ["--no-progress"] if options.no_progress else []
+    log = out / "log.mcap"
+    before = _written(log)
     code = _onboard(arguments)
     if code == WRONG_INPUT:
         return WRONG_INPUT
+    recorded = _written(log) != before
     if code not in (COMPLETED, INTERRUPTED):
-        print(f"pipewright: the flight process failed (code {code}); what it recorded is reported", file=sys.stderr)
-    outcome = _evaluate(out / "log.mcap", partial=True, begun=begun)
+        rest = "what it recorded is reported" if recorded else "it recorded nothing"
+        print(f"pipewright: the flight process failed (code {code}); {rest}", file=sys.stderr)
+    if not recorded:
+        return INTERRUPTED if code == INTERRUPTED else BROKEN
+    outcome = _evaluate(log, partial=True, begun=begun)
     return EXIT_CODES[outcome] if code == COMPLETED else INTERRUPTED if code == INTERRUPTED else BROKEN
 
 
@@ -171,6 +179,11 @@ def _onboard(arguments: list[str]) -> int:
 
 def _log(path: Path) -> Path:
     return path / "log.mcap" if path.is_dir() else path
+
+
+def _written(path: Path) -> int:
+    """When a file was last written, ns; 0 when there is none."""
+    return path.stat().st_mtime_ns if path.exists() else 0
 
 
 def _run_folder(path: Path) -> Path:

@@ -10,7 +10,7 @@ for (const chart of document.querySelectorAll("svg.chart[data-range]")) {
     label: line.dataset.label,
     points: line.getAttribute("points").split(" ").map((point) => point.split(",").map(Number)),
   }));
-  const cursor = document.createElementNS("http://www.w3.org/2000/svg", "path");
+  const cursor = document.createElementNS(chart.namespaceURI, "path");
   cursor.setAttribute("class", "cursor");
   chart.append(cursor);
   const hide = () => { readout.hidden = true; cursor.setAttribute("d", ""); };

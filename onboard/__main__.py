@@ -1,5 +1,9 @@
-"""``python -m onboard``."""
+"""``python -m onboard``. An interrupt ends it with code 130; what was recorded until then is a complete log."""
 
-from onboard.main import main
+try:
+    from onboard.main import main
 
-raise SystemExit(main())
+    code = main()
+except KeyboardInterrupt:
+    code = 130
+raise SystemExit(code)
