@@ -15,8 +15,6 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from drivers.samples import Vec3
-
 
 def _meta(unit: str, doc: str, low: float | None = None, high: float | None = None) -> Meta:
     return Meta(ge=low, le=high, description=doc, extra={"unit": unit, "in_flight": False})
@@ -25,6 +23,7 @@ def _meta(unit: str, doc: str, low: float | None = None, high: float | None = No
 Mass = Annotated[float, _meta("kg", "mass", 0.0, 20.0)]
 Length = Annotated[float, _meta("m", "length", 0.0, 2.0)]
 Offset = Annotated[float, _meta("m", "signed offset", -2.0, 2.0)]
+Angle = Annotated[float, _meta("rad", "mechanical stop of a joint", -6.3, 6.3)]
 Inertia = Annotated[float, _meta("kg m^2", "moment of inertia about the part's centre of mass", 0.0, 5.0)]
 
 
@@ -97,9 +96,9 @@ class Arm(Struct, frozen=True, forbid_unknown_fields=True):
     """Wrist to sleeve contact point, along u(theta_3)."""
     needle: Length
     """Wrist to needle tip, along u(theta_3 + pi/2)."""
-    joint_min: Vec3
+    joint_min: tuple[Angle, Angle, Angle]
     """Lowest joint angles, rad."""
-    joint_max: Vec3
+    joint_max: tuple[Angle, Angle, Angle]
     """Highest joint angles, rad."""
     elbow_min: Annotated[float, _meta("rad", "smallest |theta_2 - theta_1| and distance to pi", 0.0, 1.5)]
     parts: tuple[Part, ...]

@@ -7,7 +7,7 @@ extra={"unit": "m", "in_flight": True})] = default``. This module knows no concr
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -100,19 +100,22 @@ def _describe(info: mi.StructType, path: Key, instance: Struct | None) -> Iterat
             case mi.VarTupleType(item_type=mi.StructType() as item):
                 yield from _describe(item, (*here, "N"), None)
             case _:
-                leaf = declared
+                leaves = [declared]
                 if isinstance(declared.type, mi.TupleType | mi.VarTupleType):
-                    items = _items(declared.type)
-                    leaf = declared.inner(items[0]) if items and all(i == items[0] for i in items) else declared
+                    leaves = [declared.inner(item) for item in _items(declared.type)] or leaves
                 yield Parameter(
                     dotted(here),
                     _type_name(declared.type),
                     default if default is NODEFAULT else plain(default),
-                    leaf.unit,
-                    _bounds(leaf.type),
-                    leaf.in_flight,
-                    leaf.doc,
+                    leaves[0].unit,
+                    _told(_bounds(leaf.type) for leaf in leaves),
+                    all(leaf.in_flight for leaf in leaves),
+                    _told(leaf.doc for leaf in leaves),
                 )
+
+
+def _told(texts: Iterable[str]) -> str:
+    return "; ".join(dict.fromkeys(filter(None, texts)))
 
 
 def _items(info: mi.TupleType | mi.VarTupleType) -> tuple[mi.Type, ...]:

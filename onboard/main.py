@@ -33,12 +33,8 @@ class Progress:
         if shown:
             from tqdm import tqdm
 
-            self._bar = tqdm(
-                total=len(CHAIN) - 1,
-                bar_format="{desc:<12} |{bar:30}| {postfix[0]:7.1f} s simulated, {elapsed} elapsed",
-                postfix=[0.0],
-                leave=False,
-            )
+            form = "{desc:<12} |{bar:30}| {postfix}, {elapsed} elapsed"
+            self._bar = tqdm(total=len(CHAIN) - 1, bar_format=form, leave=False)
         self._count = 0
 
     def __call__(self, outputs: Outputs, t: float) -> None:
@@ -53,8 +49,7 @@ class Progress:
                 self._bar.n = CHAIN.index(outputs.phase)
         elif self._count % 250:
             return
-        self._bar.postfix[0] = t
-        self._bar.refresh()
+        self._bar.set_postfix_str(f"{t:6.1f} s simulated")
 
     def close(self) -> None:
         """Take the bar away."""

@@ -37,9 +37,13 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     leak: Annotated[float, spec("1/s", 0.0, 5.0, "rate at which the adapted force is forgotten")] = 0.0
     compliant: Annotated[bool, note("replace stiffness and damping along the contact normal while pressing")] = True
     freeze_in_contact: Annotated[bool, note("no adaptation along the contact normal near the pipe")] = True
-    contact_stiffness: Annotated[float, spec("1/s^2", 0.0, 20.0, "stiffness per mass along the normal in contact")] = 0.3
+    contact_stiffness: Annotated[float, spec("1/s^2", 0.0, 20.0, "stiffness per mass along the normal in contact")] = (
+        0.3
+    )
     contact_damping: Annotated[float, spec("1/s", 0.0, 20.0, "damping per mass along the normal in contact")] = 1.2
-    feed_forward: Annotated[float, spec("1", 0.0, 1.5, "share of the desired contact force added along the normal")] = 1.0
+    feed_forward: Annotated[float, spec("1", 0.0, 1.5, "share of the desired contact force added along the normal")] = (
+        1.0
+    )
 
 
 class State(Struct, frozen=True, gc=False):
@@ -84,7 +88,8 @@ def step(
     nx, ny = normal
     if contact > 0.0 and p.compliant:
         correction = contact * (
-            (damping - p.contact_damping) * (ux * nx + uy * ny) + (stiffness - p.contact_stiffness) * (ex * nx + ey * ny)
+            (damping - p.contact_damping) * (ux * nx + uy * ny)
+            + (stiffness - p.contact_stiffness) * (ex * nx + ey * ny)
         )
         vx += correction * nx
         vy += correction * ny

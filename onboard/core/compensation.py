@@ -33,7 +33,11 @@ class State(Struct, frozen=True, gc=False):
 
 
 def wrist_in_body(
-    wrist: tuple[float, float], wrist_rate: tuple[float, float], mount: tuple[float, float], pitch: float, pitch_rate: float
+    wrist: tuple[float, float],
+    wrist_rate: tuple[float, float],
+    mount: tuple[float, float],
+    pitch: float,
+    pitch_rate: float,
 ) -> tuple[float, float, float, float]:
     """Wrist relative to the mount in the arm plane of B (m) and its rate (m/s): (x, z, x', z').
 

@@ -25,7 +25,9 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     """How the laws are joined."""
 
     coupling: Annotated[bool, note("feed the arm's reaction on the base, and the base's acceleration, forward")] = True
-    contact_torque: Annotated[bool, note("feed the desired contact force's torque on attitude and joints forward")] = True
+    contact_torque: Annotated[bool, note("feed the desired contact force's torque on attitude and joints forward")] = (
+        True
+    )
     contact_blend: Annotated[float, spec("s", 0.0, 5.0, "time in which the translation law turns compliant")] = 0.3
     attitude_lead: Annotated[float, spec("s", 0.0, 0.5, "lead of the attitude set-point over the reference")] = 0.0
     rate_lead: Annotated[float, spec("s", 0.0, 0.5, "lead of the body-rate set-point over the reference")] = 0.0
@@ -45,9 +47,15 @@ class State(Struct, frozen=True, gc=False):
 
 
 def step(
-    state: State, estimate: Estimate, reference: Reference, flying: bool, near_pipe: bool, derived: Derived, params: AllParams,
+    state: State,
+    estimate: Estimate,
+    reference: Reference,
+    flying: bool,
+    near_pipe: bool,
+    derived: Derived,
+    params: AllParams,
     dt: float,
-) -> tuple[State, Control]:  # fmt: skip
+) -> tuple[State, Control]:
     """One tick of the laws. flying: off the ground (the laws adapt); near_pipe: the tip is at the pipe."""
     own, model = params.control, derived.model
     p, v, rpy, rpy_rate = estimate.p_WB, estimate.v_WB, estimate.rpy, estimate.rpy_rate
@@ -59,7 +67,7 @@ def step(
     contact = min(1.0, state.contact + change) if reference.pressing else max(0.0, state.contact - change)
 
     rp, rv, ra = reference.p, reference.v, reference.a
-    translation, force, acceleration = backstepping.step(
+    translation, force, _ = backstepping.step(
         state.backstepping,
         (p[0] - rp[0], p[1] - rp[1], p[2] - rp[2]),
         (v[0] - rv[0], v[1] - rv[1], v[2] - rv[2]),

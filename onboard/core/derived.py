@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Derived:
-    """Model and site of one parameter set. Raises ``plan.Infeasible`` when the pipe cannot be repaired."""
+    """Model and site of one parameter set. Raises ``plan.InfeasibleError`` when the pipe cannot be repaired."""
 
     def __init__(self, params: Params) -> None:
         self.params = params

@@ -30,8 +30,12 @@ ON_GROUND = (Phase.PREFLIGHT, Phase.STOPPED)
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
     """How samples are used."""
 
-    extrapolate_max: Annotated[float, spec("s", 0.0, 0.2, "position is carried forward by velocity for at most this age")] = 0.06
-    released_at: Annotated[float, spec("rad", -3.14, 3.14, "measured gripper angle beyond which the sleeve is gone")] = 0.8
+    extrapolate_max: Annotated[
+        float, spec("s", 0.0, 0.2, "position is carried forward by velocity for at most this age")
+    ] = 0.06
+    released_at: Annotated[
+        float, spec("rad", -3.14, 3.14, "measured gripper angle beyond which the sleeve is gone")
+    ] = 0.8
 
 
 class State(Struct, frozen=True, gc=False):

@@ -1,5 +1,8 @@
-"""The desired contact force: from the force at the trigger to a small bias, a quintic ramp to the set force,
-a hold, and a quintic ramp back to the bias before the sleeve is released."""
+"""The desired contact force over time.
+
+From the force at the trigger to a small bias, a quintic ramp to the set force, a hold, and a quintic ramp back to the
+bias before the sleeve is released.
+"""
 
 from __future__ import annotations
 

@@ -189,7 +189,8 @@ def step(
         wanted = fuzzy.evaluate(force - estimate.contact_force, max(0.0, estimate.rpy[1]), params.fuzzy)
         compliant, acceleration = admittance.step(compliant, wanted, params.admittance, dt)
     state = State(
-        phase, state.legs, state.index, state.time, state.start, state.start_rate, state.start_acceleration, state.moving,
+        phase, state.legs, state.index, state.time, state.start, state.start_rate, state.start_acceleration,
+        state.moving,
         state.at, state.rate, state.acceleration, state.home, settled, clock, lift, press_time, state.press_start,
         force, easing, compliant, released_for,
     )  # fmt: skip
@@ -221,7 +222,8 @@ def _reference(state: State, params: AllParams, compliant: float, pressing: bool
     leg = state.legs[state.index] if state.index < len(state.legs) else None
     return Reference(
         (x, y, z), (vx, vy, vz), (ax, ay, az), yaw, yaw_rate, yaw_acceleration, (wx, wz), (vwx, vwz), elevation,
-        elevation_rate, pump, own.gripper_open if open_gripper else own.gripper_closed, state.lift, state.force, pressing,
+        elevation_rate, pump, own.gripper_open if open_gripper else own.gripper_closed, state.lift, state.force,
+        pressing,
         leg is not None and leg.pumping, compliant, offset.velocity, offset.displacement,
     )  # fmt: skip
 
@@ -237,9 +239,9 @@ def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived:
         # the translation law pushes as it did at the trigger: with what it feeds forward, and an offset for the rest
         push = min(max(0.0, estimate.contact_force), params.repair.force)
         lead = (1.0 - params.backstepping.feed_forward) * push / derived.normal_stiffness
-        x, y, z, *rest = _base_measured(state.at, estimate)
         n = site.normal
-        state = _start_from(state, (x + lead * n[0], y + lead * n[1], z, *rest))
+        at = _base_measured(state.at, estimate)
+        state = _start_from(state, (at[0] + lead * n[0], at[1] + lead * n[1], *at[2:]))
         state = replace(state, press_time=0.0, press_start=push, admittance=admittance.State())
         force = push
     elif phase is not Phase.RELEASE:
@@ -254,7 +256,9 @@ def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived:
     state = replace(state, phase=phase, force=force, easing=easing, settled=0.0, clock=0.0, index=0, time=0.0)
     if phase is Phase.RELEASE or easing >= 0.0:
         return replace(state, legs=())
-    state = replace(state, start=state.at, start_rate=state.rate, start_acceleration=state.acceleration, moving=any(state.rate))
+    state = replace(
+        state, start=state.at, start_rate=state.rate, start_acceleration=state.acceleration, moving=any(state.rate)
+    )
     return replace(state, legs=_plan(phase, state, site, params))
 
 
@@ -374,7 +378,8 @@ def _follow(state: State, site: Site, params: AllParams, dt: float) -> State:
         b[0] - a[0], b[1] - a[1], b[2] - a[2], b[3] - a[3], b[4] - a[4], b[5] - a[5], b[6] - a[6], b[7] - a[7]
     )  # fmt: skip
     at: Eight = (
-        a[0] + d0 * s, a[1] + d1 * s, a[2] + d2 * s, a[3] + d3 * s, a[4] + d4 * s, a[5] + d5 * s, a[6] + d6 * s, a[7] + d7 * s
+        a[0] + d0 * s, a[1] + d1 * s, a[2] + d2 * s, a[3] + d3 * s,
+        a[4] + d4 * s, a[5] + d5 * s, a[6] + d6 * s, a[7] + d7 * s,
     )  # fmt: skip
     rate: Eight = (d0 * ds, d1 * ds, d2 * ds, d3 * ds, d4 * ds, d5 * ds, d6 * ds, d7 * ds)
     acceleration: Eight = (d0 * dds, d1 * dds, d2 * dds, d3 * dds, d4 * dds, d5 * dds, d6 * dds, d7 * dds)

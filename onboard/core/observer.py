@@ -26,8 +26,12 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     """Filter and form of the observer."""
 
     cutoff: Annotated[float, spec("rad/s", 0.1, 200.0, "omega_c of eq. 14")] = 30.0
-    desired_acceleration: Annotated[bool, note("add the desired acceleration to the model, as eq. 11 is printed")] = False
-    thrust_lag: Annotated[float, spec("s", 0.0, 0.5, "first-order lag from thrust command to thrust in the model")] = 0.0
+    desired_acceleration: Annotated[bool, note("add the desired acceleration to the model, as eq. 11 is printed")] = (
+        False
+    )
+    thrust_lag: Annotated[float, spec("s", 0.0, 0.5, "first-order lag from thrust command to thrust in the model")] = (
+        0.0
+    )
     tare: Annotated[bool, note("subtract the mean force read in hover just before the contact")] = True
 
 
@@ -57,7 +61,9 @@ def step(
     acceleration: measured, m/s^2, W. desired: acceleration of the reference, m/s^2, W. thrust: commanded over
     the last tick, N. thrust_axis: third column of R_b. mass: of the whole vehicle, kg.
     """
-    lagged = thrust if params.thrust_lag <= 0.0 else state.thrust + (thrust - state.thrust) * dt / (params.thrust_lag + dt)
+    lagged = (
+        thrust if params.thrust_lag <= 0.0 else state.thrust + (thrust - state.thrust) * dt / (params.thrust_lag + dt)
+    )
     lift = lagged / mass
     mx, my, mz = lift * thrust_axis[0], lift * thrust_axis[1], lift * thrust_axis[2] - gravity
     if params.desired_acceleration:

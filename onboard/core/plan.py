@@ -7,7 +7,7 @@ points into the pipe; the base always stands at crack - distance * n, its arm mo
 
 from __future__ import annotations
 
-from math import cos, hypot, inf, pi, radians, sin
+from math import cbrt, cos, hypot, inf, pi, radians, sin, sqrt
 from typing import Annotated
 
 from msgspec import Struct
@@ -33,7 +33,9 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     press_reach: Annotated[float, spec("m", 0.1, 0.39, "wrist ahead of the mount while pressing")] = 0.30
     needle_reach: Annotated[float, spec("m", 0.1, 0.39, "wrist ahead of the mount at the middle of the arc")] = 0.25
     needle_gap: Annotated[float, spec("m", 0.0, 0.02, "needle tip above the pipe's surface")] = 0.003
-    needle_clear: Annotated[float, spec("m", 0.005, 0.1, "needle lifted off the surface before and after the arc")] = 0.03
+    needle_clear: Annotated[float, spec("m", 0.005, 0.1, "needle lifted off the surface before and after the arc")] = (
+        0.03
+    )
     arc_max: Annotated[float, spec("rad", 0.1, 2.5, "half the arc to dispense on, when reachable")] = 1.3
     link_clear: Annotated[float, spec("m", 0.0, 0.2, "least distance of link 2 from the pipe's surface")] = 0.02
     fold: tuple[
@@ -71,7 +73,7 @@ class Leg(Struct, frozen=True, gc=False):
 def duration(distance: float, speed: float, acceleration: float, jerk: float) -> float:
     """Shortest time (s) of a rest-to-rest quintic over ``distance`` within the three peak limits."""
     d = abs(distance)
-    return max(15.0 / 8.0 * d / speed, (5.7735 * d / acceleration) ** 0.5, (60.0 * d / jerk) ** (1.0 / 3.0))
+    return max(15.0 / 8.0 * d / speed, sqrt(5.7735 * d / acceleration), cbrt(60.0 * d / jerk))
 
 
 class Site(Struct, frozen=True, gc=False):
@@ -90,12 +92,12 @@ class Site(Struct, frozen=True, gc=False):
     """Reachable arc: first and last angle about the pipe's axis, rad; 0 faces the vehicle, positive is up."""
 
 
-class Infeasible(ValueError):
+class InfeasibleError(ValueError):
     """The pipe cannot be repaired from where the parameters put it; the text says why."""
 
 
 def survey(pipe: Pipe, vehicle: Vehicle, params: Params) -> Site:
-    """Places of the mission. Raises ``Infeasible`` when arm or airframe cannot do it."""
+    """Places of the mission. Raises ``InfeasibleError`` when arm or airframe cannot do it."""
     yaw = radians(pipe.heading_deg)
     normal = (cos(yaw), sin(yaw))
     x, y, z = pipe.position
@@ -113,29 +115,35 @@ def survey(pipe: Pipe, vehicle: Vehicle, params: Params) -> Site:
     )
     lowest = z - pipe.radius - vehicle.base.gear_height
     if lowest < 0.3:
-        raise Infeasible(f"pipe.position z = {z} m: no room to fly under the arm; at least {z + 0.3 - lowest:.2f} m is needed")
-    rotor = hypot(vehicle.rotors.arm_x, 0.0) + vehicle.rotors.radius
+        raise InfeasibleError(
+            f"pipe.position z = {z} m: no room to fly under the arm; at least {z + 0.3 - lowest:.2f} m is needed"
+        )
+    rotor = vehicle.rotors.arm_x + vehicle.rotors.radius
     if min(site.needle, site.near - params.gap) - rotor < 0.05:
-        raise Infeasible("plan.needle_reach / plan.press_reach: the propellers would come closer than 5 cm to the pipe")
+        raise InfeasibleError(
+            "plan.needle_reach / plan.press_reach: the propellers would come closer than 5 cm to the pipe"
+        )
     if hypot(x, y) > 50.0:
-        raise Infeasible(f"pipe.position: {hypot(x, y):.0f} m from the start; at most 50 m")
+        raise InfeasibleError(f"pipe.position: {hypot(x, y):.0f} m from the start; at most 50 m")
     near_home = _from_pipe((0.0, 0.0, 0.0), (0.0, 0.0, params.takeoff_height), pipe, normal)
     if near_home < params.clearance:
-        raise Infeasible(
+        raise InfeasibleError(
             f"pipe.position {pipe.position}: the pipe passes {near_home:.2f} m from the take-off path; "
             f"at least {params.clearance} m is needed"
         )
     if not _reaches(params.press_reach, 0.0, vehicle):
-        raise Infeasible(f"plan.press_reach = {params.press_reach} m: the arm cannot hold the wrist there")
+        raise InfeasibleError(f"plan.press_reach = {params.press_reach} m: the arm cannot hold the wrist there")
     angles = [_farthest(sign, pipe.radius, needle_radius, vehicle, params) for sign in (-1.0, 1.0)]
     if angles[1] - angles[0] < radians(20.0):
-        raise Infeasible(f"pipe.radius = {pipe.radius} m: the needle reaches no useful arc of the pipe")
+        raise InfeasibleError(f"pipe.radius = {pipe.radius} m: the needle reaches no useful arc of the pipe")
     return Site(
         site.yaw, site.normal, site.crack, site.height, site.far, site.needle, site.near, (angles[0], angles[1])
     )
 
 
-def wrist_on_arc(angle: float, radius: float, pipe_radius: float, vehicle: Vehicle, params: Params) -> tuple[float, float, float]:
+def wrist_on_arc(
+    angle: float, radius: float, pipe_radius: float, vehicle: Vehicle, params: Params
+) -> tuple[float, float, float]:
     """Wrist (forward, up; m) and gripper elevation (rad) with the needle square on the pipe at ``angle``.
 
     radius: distance of the needle tip from the pipe's axis, m.

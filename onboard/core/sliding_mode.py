@@ -59,10 +59,8 @@ class State(Struct, frozen=True, gc=False):
 
 def surface_rate(error: float, gains: Gains) -> float:
     """lambda e_reg^(r/eta) sign(e), rad/s: the rate at which the surface s = 0 takes ``error`` to zero."""
-    size = abs(error)
-    if size <= gains.epsilon:
-        return gains.sliding * gains.epsilon ** (gains.exponent - 1.0) * error
-    return gains.sliding * size ** (gains.exponent - 1.0) * error
+    slope: float = gains.sliding * max(abs(error), gains.epsilon) ** (gains.exponent - 1.0)
+    return slope * error
 
 
 def step(

@@ -10,14 +10,15 @@ from onboard.core.derived import derive
 from onboard.core.params import Params
 from onboard.core.types import Event, Inputs, Outputs, Reference
 
+
 class State(Struct, frozen=True, gc=False):
     """All that the core remembers from one tick to the next."""
 
     estimate: estimate.State
     safety: safety.State
     mission: mission.State
-    guidance: guidance.State
     progress: guidance.Progress
+    guidance: guidance.State
     reference: Reference | None
     control: control.State
     limits: limits.State
@@ -31,7 +32,7 @@ class State(Struct, frozen=True, gc=False):
 def initial_state(params: Params) -> State:
     """On the ground, before the first sample."""
     return State(
-        estimate.State(), safety.initial(), mission.initial(), guidance.initial(), guidance.Progress(), None,
+        estimate.State(), safety.initial(), mission.initial(), guidance.Progress(), guidance.initial(), None,
         control.State(), limits.State(), 0.0, False, False,
     )  # fmt: skip
 
@@ -56,22 +57,22 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
     guided, reference, progress = guidance.step(
         state.guidance, believed, task.phase, known.engaged, _pump(seen), derived, params, dt
     )
-    laws, wanted = control.step(
-        state.control, believed, reference, flying and reference.lift >= 1.0, task.phase in estimate.NEAR_PIPE,
-        derived, params, dt,
-    )  # fmt: skip
+    aloft = flying and reference.lift >= 1.0
+    at_pipe = task.phase in estimate.NEAR_PIPE
+    laws, wanted = control.step(state.control, believed, reference, aloft, at_pipe, derived, params, dt)
     engage = mission.engage(task, known)
+    obeyed = known.engaged and engage is Engage.OFFBOARD
     autopilot = actuation.autopilot_command(wanted, engage, params.interface)
     # torques for joints that are not seen any more would fling the arm: the servos hold it by themselves
     joints = params.joints if believed.age_servos <= params.safety.servos_late else JointMode.POSITION
     servos = actuation.servo_command(wanted, reference, joints, params.joint_current)
+    permission = facts.permission(task.phase, engage, believed, aloft)
     gate, autopilot, servos, clipped = limits.step(
-        state.limits, autopilot, servos, facts.permission(task.phase, engage, believed, flying and reference.lift >= 1.0),
-        facts.measured(seen), derived.bounds, dt,
-    )  # fmt: skip
+        state.limits, autopilot, servos, permission, facts.measured(seen), derived.bounds, dt
+    )
     events = tuple(Event(inputs.t_ns, *text) for text in (*alarms, *said)) if alarms or said else ()
     return (
-        State(seen, safe, task, guided, progress, reference, laws, gate, autopilot.thrust, flying, known.engaged and engage is Engage.OFFBOARD),
+        State(seen, safe, task, progress, guided, reference, laws, gate, autopilot.thrust, flying, obeyed),
         Outputs(task.phase, task.phase_time, verdict, believed, reference, wanted, autopilot, servos, clipped, events),
     )
 

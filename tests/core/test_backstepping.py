@@ -25,7 +25,6 @@ def law(state=State(), error=(0.0, 0.0, 0.0), rate=(0.0, 0.0, 0.0), acceleration
 
 
 @given(vector(2.0), vector(2.0), vector(3.0), vector(3.0))
-
 def test_is_equations_2_and_3(error, rate, acceleration, disturbance):
     p = PRINTED
     alpha, gamma = (p.alpha, p.alpha, p.alpha_z), (p.gamma, p.gamma, p.gamma_z)
@@ -54,7 +53,6 @@ def test_leak_forgets():
 
 
 @given(vector(1e6), vector(1e6), vector(1e6), number(3.2), st.floats(0.0, 1.0), st.booleans(), number(10.0))
-
 def test_finite_in_finite_out(error, rate, acceleration, heading, contact, hold, force):
     state, tau, v = law(State(), error, rate, acceleration, heading, contact, True, hold, force, Params())
     assert all(isfinite(x) for x in (*tau, *v, *state.disturbance))
@@ -62,14 +60,20 @@ def test_finite_in_finite_out(error, rate, acceleration, heading, contact, hold,
 
 
 @given(vector(1.0), vector(1.0), vector(1.0), number(3.2), st.floats(0.0, 1.0))
-
 def test_is_odd_but_for_the_weight(error, rate, acceleration, heading, contact):
     def flip(v):
         return tuple(-x for x in v)
 
-    _, tau, _ = law(error=error, rate=rate, acceleration=acceleration, heading=heading, contact=contact, params=Params())
+    _, tau, _ = law(
+        error=error, rate=rate, acceleration=acceleration, heading=heading, contact=contact, params=Params()
+    )
     _, back, _ = law(
-        error=flip(error), rate=flip(rate), acceleration=flip(acceleration), heading=heading, contact=contact, params=Params()
+        error=flip(error),
+        rate=flip(rate),
+        acceleration=flip(acceleration),
+        heading=heading,
+        contact=contact,
+        params=Params(),
     )
     for i in range(3):
         assert tau[i] + back[i] == pytest.approx(2.0 * WEIGHT if i == 2 else 0.0, abs=1e-9)

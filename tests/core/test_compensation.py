@@ -16,7 +16,6 @@ MOUNT = (0.06, -0.06)
 
 
 @given(st.floats(-0.5, 0.5), st.floats(-1.5, 1.5))
-
 def test_theta_3_keeps_the_tool_in_the_world(pitch, elevation):
     """Eq. 10 against eq. 17: with theta_3 = elevation + pitch, R_WB R_ee does not change with the pitch."""
 
@@ -29,7 +28,6 @@ def test_theta_3_keeps_the_tool_in_the_world(pitch, elevation):
 
 
 @given(st.floats(-0.5, 0.5), st.floats(0.0, 0.4), st.floats(-0.2, 0.2))
-
 def test_the_wrist_stays_in_the_world(pitch, forward, up):
     x, z, _, _ = compensation.wrist_in_body((forward, up), (0.0, 0.0), MOUNT, pitch, 0.0)
     R = math3.matrix_from_euler((0.0, pitch, 0.0))
@@ -38,12 +36,13 @@ def test_the_wrist_stays_in_the_world(pitch, forward, up):
 
 
 @given(number(0.4), number(1.0), st.floats(0.1, 0.38), number(0.1), number(0.2), number(0.2))
-
 def test_rates_are_the_derivative(pitch, pitch_rate, forward, up, vx, vz):
     h = 1e-6
 
     def at(t):
-        return compensation.wrist_in_body((forward + vx * t, up + vz * t), (vx, vz), MOUNT, pitch + pitch_rate * t, pitch_rate)
+        return compensation.wrist_in_body(
+            (forward + vx * t, up + vz * t), (vx, vz), MOUNT, pitch + pitch_rate * t, pitch_rate
+        )
 
     a, b, now = at(-h), at(h), at(0.0)
     assert now[2] == pytest.approx((b[0] - a[0]) / (2 * h), abs=1e-6)

@@ -27,7 +27,6 @@ def test_admittance_integrates_twice_when_undamped():
 
 
 @given(st.lists(number(5.0), min_size=1, max_size=60))
-
 def test_admittance_is_bounded_odd_and_does_not_wind_up(accelerations):
     p = admittance.Params()
     state, mirror = admittance.State(), admittance.State()
@@ -50,7 +49,9 @@ MASS, G = 2.4, 9.80665
 
 def observe(force, params, desired=(0.0, 0.0, 0.0), seconds=2.0, state=observer.State(), axis=(0.0, 0.0, 1.0)):
     thrust = MASS * G
-    measured = tuple(thrust * a / MASS + f / MASS - (G if i == 2 else 0.0) for i, (a, f) in enumerate(zip(axis, force, strict=True)))
+    measured = tuple(
+        thrust * a / MASS + f / MASS - (G if i == 2 else 0.0) for i, (a, f) in enumerate(zip(axis, force, strict=True))
+    )
     for _ in range(round(seconds / DT)):
         state = observer.step(state, measured, desired, thrust, axis, MASS, G, params, DT)
     return state
@@ -94,14 +95,17 @@ def test_tare_removes_what_is_read_in_hover():
 
 def test_thrust_lag_delays_the_model():
     p = observer.Params(thrust_lag=0.04, cutoff=200.0)
-    state = observer.step(observer.State(thrust=20.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 24.0, (0.0, 0.0, 1.0), MASS, G, p, DT)
+    state = observer.step(
+        observer.State(thrust=20.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 24.0, (0.0, 0.0, 1.0), MASS, G, p, DT
+    )
     assert state.thrust == pytest.approx(20.0 + 4.0 * DT / (0.04 + DT))
 
 
 @given(vector(1e4), vector(1e4), st.floats(0.0, 60.0))
-
 def test_observer_is_finite(acceleration, desired, thrust):
-    state = observer.step(observer.State(), acceleration, desired, thrust, (0.1, 0.0, 0.99), MASS, G, observer.Params(), DT)
+    state = observer.step(
+        observer.State(), acceleration, desired, thrust, (0.1, 0.0, 0.99), MASS, G, observer.Params(), DT
+    )
     assert all(isfinite(x) for x in state.force)
 
 

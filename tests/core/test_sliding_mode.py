@@ -17,7 +17,6 @@ DT = 0.004
 
 
 @given(st.floats(0.021, 1.0), number(1.0), number(3.0))
-
 def test_is_equations_5_to_7_outside_the_regularisation(error, rate, acceleration):
     g = P.attitude
     e = (error, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -42,7 +41,6 @@ def test_surface_is_continuous_and_rising_through_epsilon_and_zero(gains):
 
 
 @given(vector(1e3, 6), vector(1e3, 6), vector(1e3, 6), vector(20.0, 6), vector(0.4, 6))
-
 def test_finite_bounded_and_odd(error, rate, acceleration, integral, adapted):
     def flip(v):
         return tuple(-x for x in v)
@@ -51,7 +49,9 @@ def test_finite_bounded_and_odd(error, rate, acceleration, integral, adapted):
     assert all(isfinite(x) for x in out)
     for i, g in enumerate((P.attitude,) * 3 + (P.joints,) * 3):
         assert abs(xi[i]) <= g.adaptation_bound and abs(state.integral[i]) <= g.integral_bound
-    _, other, _ = sliding_mode.step(State(flip(integral), flip(adapted)), flip(error), flip(rate), flip(acceleration), True, P, DT)
+    _, other, _ = sliding_mode.step(
+        State(flip(integral), flip(adapted)), flip(error), flip(rate), flip(acceleration), True, P, DT
+    )
     assert other == pytest.approx(flip(out))
 
 

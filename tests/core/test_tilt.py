@@ -27,7 +27,6 @@ def test_signs_against_the_rotation_matrix():
 
 
 @given(number(4.0), number(4.0), st.floats(10.0, 40.0), number(3.1))
-
 def test_exact_form_yields_the_force(fx, fy, fz, yaw):
     roll, pitch, thrust = tilt.attitude_and_thrust((fx, fy, fz), yaw, Params(exact=True, tilt_max=0.8))
     R = math3.matrix_from_euler((roll, pitch, yaw))
@@ -35,7 +34,6 @@ def test_exact_form_yields_the_force(fx, fy, fz, yaw):
 
 
 @given(number(0.5), number(0.5), number(3.1))
-
 def test_printed_form_is_the_small_angle_limit(fx, fy, yaw):
     force = (fx, fy, 24.0)
     printed, exact = tilt.attitude_and_thrust(force, yaw, PRINTED), tilt.attitude_and_thrust(force, yaw, EXACT)
@@ -45,7 +43,6 @@ def test_printed_form_is_the_small_angle_limit(fx, fy, yaw):
 
 
 @given(vector(1e6), number(10.0), st.booleans())
-
 def test_guarded_and_limited(force, yaw, exact):
     p = Params(exact=exact)
     roll, pitch, thrust = tilt.attitude_and_thrust(force, yaw, p)

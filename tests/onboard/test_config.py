@@ -78,8 +78,7 @@ def test_every_default_lies_within_its_bounds() -> None:
 def test_every_number_has_bounds_and_a_meaning() -> None:
     numbers = [parameter for parameter in describe(Config) if "number" in parameter.type]
     assert len(numbers) > 100
-    exempt = {"vehicle.arm.joint_min", "vehicle.arm.joint_max"}  # Plain vectors at the edge; mechanical stops.
-    assert [p.path for p in numbers if not (p.bounds and p.doc) and p.path not in exempt] == []
+    assert [p.path for p in numbers if not (p.bounds and p.doc)] == []
 
 
 def test_nothing_physical_may_change_in_flight() -> None:
@@ -113,12 +112,19 @@ def test_the_seed_option_wins_over_all(configs: Path) -> None:
         ("vehicle.base.mass=2", "vehicle.base.mass", 2.0),
         ("vehicle.arm.parts.2.mass=0.02", "vehicle.arm.parts.2.mass", 0.02),
         ("pipe.position.2=2.5", "pipe.position.2", 2.5),
-        ("interface=attitude", "interface", "attitude"),
+        ("joints=position", "joints", "position"),
     ],
 )
 def test_options_reach_scenario_laws_and_vehicle(option: str, path: str, value: object) -> None:
     changes = diff(load_config(), load_config(sets=[option]))
     assert [(change.path, change.new) for change in changes] == [(path, value)]
+
+
+def test_the_interface_brings_its_gains_and_options_still_win() -> None:
+    rate = load_config(sets=["interface=body_rate", "tilt.bandwidth=7"])
+    assert rate.interface == "body_rate"
+    assert rate.control.rate_lead > 0.0 == load_config().control.rate_lead
+    assert rate.tilt.bandwidth == 7.0
 
 
 def test_an_option_reaches_every_parameter() -> None:
