@@ -93,6 +93,14 @@ def _parser() -> argparse.ArgumentParser:
     report = commands.add_parser("report", help=words, description=words.capitalize() + ".")
     report.add_argument("log", type=Path, metavar="LOG", help=_LOG_HELP)
     report.add_argument("--partial", action="store_true", help="accept a log that was cut off")
+    report.add_argument(
+        "--beside",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="LOG",
+        help="another run to show in the table; may be repeated",
+    )
     report.set_defaults(run=_report)
     return parser
 
@@ -128,14 +136,16 @@ def _replay(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    _evaluate(_log(options.log), partial=options.partial)
+    beside = [_log(path) for path in options.beside]
+    _evaluate(_log(options.log), partial=options.partial, beside=beside)
     return COMPLETED
 
 
-def _evaluate(log: Path, *, partial: bool, begun: float | None = None) -> str:
+def _evaluate(log: Path, *, partial: bool, begun: float | None = None, beside: Sequence[Path] = ()) -> str:
     """Write metrics and report beside a log and print the summary; gives the outcome.
 
     begun: when the command began (perf_counter); without it the run's duration is taken from a former metrics.json.
+    beside: logs of other runs to show in the table.
     """
     # Imported here so that --help and wrong input answer at once.
     from rich.console import Console
@@ -146,6 +156,7 @@ def _evaluate(log: Path, *, partial: bool, begun: float | None = None) -> str:
 
     try:
         run = read_run(log, partial=partial)
+        others = [metrics.compute(read_run(path, partial=partial)) for path in beside]
     except LogError as error:
         raise InputError(str(error)) from None
     target = log.with_name("metrics.json")
@@ -153,8 +164,8 @@ def _evaluate(log: Path, *, partial: bool, begun: float | None = None) -> str:
     figures = metrics.compute(run, wall_s)
     page = log.with_name("report.html")
     metrics.write(figures, target)
-    report.write(run, figures, page)
-    terminal.summarize(run, figures, page, Console(highlight=False))
+    report.write(run, figures, page, others)
+    terminal.summarize(run, figures, page, Console(highlight=False), others)
     return str(figures["outcome"])
 
 

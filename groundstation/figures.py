@@ -48,7 +48,7 @@ def tracking(run: Run) -> list[Chart]:
     state = run.truth if run.truth is not None else run
     force = _contact(run, Chart("(a) contact force", "N", x))
     if run.truth is not None:
-        force.line(t, run.truth.force, "measured", "c2")
+        force.line(t, run.truth.force, "measured", "c2 broad")
     force.line(t, run.force_est, "estimated", "c1").line(t, run.force_des, "desired", "ref")
     pitch = _contact(run, Chart("(b) pitch θ", "deg", x))
     pitch.line(t, np.degrees(state.rpy[:, 1]), "θ", "c1").line(t, np.degrees(run.attitude_ref[:, 1]), "followed", "ref")
@@ -66,7 +66,7 @@ def estimation(run: Run) -> list[Chart]:
         return []
     x, t = around_contact(run), run.t
     both = _contact(run, Chart("estimated and measured contact force", "N", x, width=950))
-    both.line(t, run.truth.force, "measured", "c2").line(t, run.force_est, "estimated", "c1")
+    both.line(t, run.truth.force, "measured", "c2 broad").line(t, run.force_est, "estimated", "c1")
     error = Chart("estimated less measured, in contact", "N", x, width=950, height=150)
     span = windows(run).contact
     error.line(t[span], (run.force_est - run.truth.force)[span], "", "c1")

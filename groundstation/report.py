@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,15 @@ _BADGES = {
 }
 
 
-def write(run: Run, metrics: dict[str, Any], path: Path) -> None:
-    """Write the report of a run; ``metrics`` is what ``metrics.compute`` gave for it."""
-    path.write_text("".join(_page(run, metrics)), encoding="utf-8")
+def write(run: Run, metrics: dict[str, Any], path: Path, beside: Sequence[dict[str, Any]] = ()) -> None:
+    """Write the report of a run.
+
+    ``metrics`` is what ``metrics.compute`` gave for it, ``beside`` the same of other runs to show in the table.
+    """
+    path.write_text("".join(_page(run, metrics, beside)), encoding="utf-8")
 
 
-def _page(run: Run, metrics: dict[str, Any]) -> Iterator[str]:
+def _page(run: Run, metrics: dict[str, Any], beside: Sequence[dict[str, Any]]) -> Iterator[str]:
     info = run.info
     title = f"Pipe repair: {info.scenario}, {info.law}, seed {info.seed}"
     kind, words = _BADGES[metrics["outcome"]]
@@ -38,7 +41,7 @@ def _page(run: Run, metrics: dict[str, Any]) -> Iterator[str]:
     yield from _cards(run, metrics)
     yield "<h2>Phases</h2>"
     yield figures.timeline(run)
-    yield from _table(metrics)
+    yield from _table(metrics, beside)
     note = "The shaded stretch is the contact, from trigger to release. Point at a chart to read values."
     yield from _figure("Tracking in contact (figure 5)", note, figures.tracking(run), pair=True)
     yield from _figure(
@@ -86,23 +89,27 @@ def _card(value: str, label: str, good: bool | None) -> str:
     return f'<div class="card"><b{kind}>{escape(value)}{mark}</b><span>{escape(label)}</span></div>'
 
 
-def _table(metrics: dict[str, Any]) -> Iterator[str]:
+def _table(metrics: dict[str, Any], beside: Sequence[dict[str, Any]]) -> Iterator[str]:
     yield "<h2>Table II, side by side</h2>"
     yield (
         '<p class="note">Root mean square errors: forces from trigger to release; states against the reference '
         "that the loop follows, from the end of takeoff to the start of landing, and in contact alone.</p>"
     )
     yield '<div class="scroll"><table><tr><th></th><th class="n">paper</th><th class="n">this run</th>'
-    yield '<th class="n">in contact</th><th>unit</th><th>verdict</th></tr>'
+    yield '<th class="n">in contact</th><th>unit</th><th>verdict</th>'
+    yield "".join(f'<th class="n">{escape(table.name(other))}</th>' for other in beside) + "</tr>"
+    others = [table.rows(other) for other in beside]
     for i, row in enumerate(table.rows(metrics)):
         if i in (0, 3):
-            yield f'<tr class="group"><th colspan="6">{"states" if i else "forces"}</th></tr>'
+            yield f'<tr class="group"><th colspan="{6 + len(beside)}">{"states" if i else "forces"}</th></tr>'
         value, contact = (f"{v:.5f}" if v is not None else "" for v in (row.value, row.in_contact))
         mark = {True: '<span class="good">▲ ', False: '<span class="bad">▼ ', None: '<span class="soft">'}[row.better]
         yield (
             f'<tr><td>{escape(row.label)}</td><td class="n">{row.paper:.4f}</td><td class="n">{value}</td>'
-            f'<td class="n">{contact}</td><td>{row.unit}</td><td>{mark}{escape(row.verdict)}</span></td></tr>'
+            f'<td class="n">{contact}</td><td>{row.unit}</td><td>{mark}{escape(row.verdict)}</span></td>'
         )
+        values = (rows[i].value for rows in others)
+        yield "".join(f'<td class="n">{v:.5f}</td>' if v is not None else "<td></td>" for v in values) + "</tr>"
     yield "</table></div>"
 
 

@@ -65,6 +65,11 @@ class Figure(NamedTuple):
     """Meets what is asked of the tuned law; None where nothing is asked."""
 
 
+def name(metrics: dict[str, Any]) -> str:
+    """What tells a run from others."""
+    return f"{metrics['scenario']}, {metrics['law']}, seed {metrics['seed']}"
+
+
 def rows(metrics: dict[str, Any]) -> list[Row]:
     """The twelve rows of Table II."""
     force, state = metrics["force_rmse"], metrics["state_rmse"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,10 @@ _MARKS = {True: "[green]✓[/]", False: "[red]✗[/]", None: " "}
 _REASONS = 6
 
 
-def summarize(run: Run, metrics: dict[str, Any], report: Path, console: Console) -> None:
-    """Print outcome, Table II beside the run, the figures of the contact, and where the report is."""
+def summarize(
+    run: Run, metrics: dict[str, Any], report: Path, console: Console, beside: Sequence[dict[str, Any]] = ()
+) -> None:
+    """Print outcome, Table II beside the run (and others), the figures of the contact, and where the report is."""
     wall = metrics["wall_s"]
     speed = f" in {wall:.1f} s, {metrics['sim_s'] / wall:.0f} times real time" if wall and not run.info.realtime else ""
     console.print(f"{_WORDS[metrics['outcome']]}, {metrics['sim_s']:.1f} s{speed}")
@@ -33,16 +36,22 @@ def summarize(run: Run, metrics: dict[str, Any], report: Path, console: Console)
     side = Table(
         box=box.SIMPLE_HEAD,
         pad_edge=False,
-        padding=(0, 2, 0, 0),
+        padding=(0, 1, 0, 0),
         title="RMSE, beside Table II of the paper",
         title_justify="left",
     )
     for heading in ("", "paper", "this run", "in contact", "unit", "verdict"):
         side.add_column(heading, justify="right" if heading in ("paper", "this run", "in contact") else "left")
+    for other in beside:
+        side.add_column(f"{other['law']}\nseed {other['seed']}", justify="right", no_wrap=True)
+    columns = [table.rows(other) for other in beside]
     for i, row in enumerate(table.rows(metrics)):
-        cells = [f"{value:.5f}" if value is not None else "" for value in (row.value, row.in_contact)]
+        value, contact, *rest = (
+            f"{v:.5f}" if v is not None else ""
+            for v in (row.value, row.in_contact, *(rows[i].value for rows in columns))
+        )
         verdict = f"{_MARKS[row.better]} {row.verdict}"
-        side.add_row(row.label, f"{row.paper:.4f}", *cells, row.unit, verdict, end_section=i == 2)
+        side.add_row(row.label, f"{row.paper:.4f}", value, contact, row.unit, verdict, *rest, end_section=i == 2)
     console.print(side)
     others = Table(box=None, show_header=False, pad_edge=False)
     for figure in table.figures(metrics, run.config.repair.force):

@@ -160,6 +160,16 @@ def test_report_of_a_cut_off_log(capsys: pytest.CaptureFixture[str], elsewhere: 
     assert Path("report.html").is_file()
 
 
+def test_other_runs_stand_beside(flight: list[list[str]], capsys: pytest.CaptureFixture[str]) -> None:
+    cli.main(["sim", "--out", "a"])
+    cli.main(["sim", "--out", "b"])
+    capsys.readouterr()
+    assert cli.main(["report", "a", "--beside", "b", "--beside", "b/log.mcap"]) == 0
+    assert Path("a/report.html").read_text().count('<th class="n">paper, tuned, seed 7</th>') == 2
+    assert capsys.readouterr().out.count("0.04000") == 3
+    assert cli.main(["report", "a", "--beside", "none"]) == 2
+
+
 def test_report_of_nothing(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
     assert cli.main(["report", "none.mcap"]) == 2
     assert capsys.readouterr().err == "pipewright: none.mcap: no such log; give the log.mcap of a run folder\n"
