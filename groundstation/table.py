@@ -51,7 +51,7 @@ class Row(NamedTuple):
             return "no value"
         if self.better:
             ratio = self.paper / self.value if self.value > 0.0 else float("inf")
-            return f"better, {ratio:.3g}x" if ratio < 1000.0 else "better, over 1000x"
+            return f"better, {ratio:.3g}x" if ratio < 1000.0 else "better, >1000x"
         return f"worse, {self.value / self.paper:.3g}x"
 
 
@@ -67,7 +67,7 @@ class Figure(NamedTuple):
 
 def name(metrics: dict[str, Any]) -> str:
     """What tells a run from others."""
-    return f"{metrics['scenario']}, {metrics['law']}, seed {metrics['seed']}"
+    return f"scenario {metrics['scenario']}, law {metrics['law']}, seed {metrics['seed']}"
 
 
 def rows(metrics: dict[str, Any]) -> list[Row]:

@@ -165,7 +165,7 @@ def test_other_runs_stand_beside(flight: list[list[str]], capsys: pytest.Capture
     cli.main(["sim", "--out", "b"])
     capsys.readouterr()
     assert cli.main(["report", "a", "--beside", "b", "--beside", "b/log.mcap"]) == 0
-    assert Path("a/report.html").read_text().count('<th class="n">paper, tuned, seed 7</th>') == 2
+    assert Path("a/report.html").read_text().count('<th class="n">scenario paper, law tuned, seed 7</th>') == 2
     assert capsys.readouterr().out.count("0.04000") == 3
     assert cli.main(["report", "a", "--beside", "none"]) == 2
 
