@@ -1,22 +1,25 @@
 """``python -m onboard``: the flight process, started as a person or the ground station would.
 
-Exit codes: 0 the run ended by itself and its log is complete, 2 wrong input.
+Exit codes: 0 the run ended by itself and its log is complete, 2 wrong input, 5 a device cannot be had.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from drivers.protocols import DeviceError
+from drivers.samples import Interface
 from onboard.config import Config, dump_config, load_config
 from onboard.core.plan import InfeasibleError
 from onboard.core.types import Outputs, Phase
 from onboard.layers import ConfigError
 
-WRONG_INPUT = 2
+WRONG_INPUT, NO_DEVICE = 2, 5
 #: Phases of a mission in order, for the progress bar.
 CHAIN = (
     Phase.PREFLIGHT, Phase.TAKEOFF, Phase.APPROACH, Phase.ALIGN, Phase.ADHESIVE, Phase.TOOL_CHANGE, Phase.TARE,
@@ -61,13 +64,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     options = _parser().parse_args(arguments)
     try:
-        if options.command == "sim":
-            return _sim(options)
-        return _replay(options)
+        return {"sim": _sim, "desk": _desk, "replay": _replay}[options.command](options)
     except ConfigError as error:
         print(error, file=sys.stderr)
     except InfeasibleError as error:
         print(f"this mission cannot be flown: {error}", file=sys.stderr)
+    except DeviceError as error:
+        print(error, file=sys.stderr)
+        return NO_DEVICE
     return WRONG_INPUT
 
 
@@ -75,12 +79,15 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m onboard", description=__doc__.split("\n")[0] if __doc__ else "")
     commands = parser.add_subparsers(dest="command", required=True)
     sim = commands.add_parser("sim", help="fly the mission in a simulated world, in virtual time")
-    sim.add_argument("--scenario", default="paper")
-    sim.add_argument("--law")
-    sim.add_argument("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE")
-    sim.add_argument("--seed", type=int)
-    sim.add_argument("--out", type=Path, required=True, help="an existing or new run folder")
-    sim.add_argument("--no-progress", action="store_true")
+    desk = commands.add_parser("desk", help="fly the mission in real time, the autopilot behind MAVLink")
+    for command, scenario in ((sim, "paper"), (desk, "desk")):
+        command.add_argument("--scenario", default=scenario)
+        command.add_argument("--law")
+        command.add_argument("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE")
+        command.add_argument("--seed", type=int)
+        command.add_argument("--out", type=Path, required=True, help="an existing or new run folder")
+        command.add_argument("--no-progress", action="store_true")
+    desk.add_argument("--duration", type=float, default=600.0, metavar="SECONDS", help="then land")
     replay = commands.add_parser("replay", help="run a log's inputs through the core again and compare to the bit")
     replay.add_argument("log", type=Path)
     replay.add_argument("--from", type=float, dest="start", metavar="SECONDS")
@@ -106,6 +113,25 @@ def _sim(options: argparse.Namespace) -> int:
     progress = Progress(not options.no_progress and sys.stderr.isatty())
     try:
         simulate(config, log, progress)
+    finally:
+        progress.close()
+    return 0
+
+
+def _desk(options: argparse.Namespace) -> int:
+    from onboard.desk import fly
+
+    config = load_config(options.scenario, options.law, options.sets, options.seed)
+    if config.interface is Interface.WRENCH:
+        raise ConfigError(["interface = wrench: no autopilot accepts a wrench; choose attitude or body_rate"])
+    log = _prepare(config, options.out)
+    progress = Progress(not options.no_progress and sys.stderr.isatty())
+
+    def say(text: str) -> None:
+        print(text, file=sys.stderr)
+
+    try:
+        asyncio.run(fly(config, log, progress, say, options.duration))
     finally:
         progress.close()
     return 0
