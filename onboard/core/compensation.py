@@ -20,8 +20,11 @@ from onboard.core.spec import spec
 
 
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
-    """Smoothing of the joint reference."""
+    """Smoothing of the joint reference, and how far the arm steadies the tool."""
 
+    steady: Annotated[float, spec("1", 0.0, 1.0, "share of the base's position error that the arm makes up for")] = 1.0
+    steady_blend: Annotated[float, spec("s", 0.05, 5.0, "time in which that begins and ends")] = 1.0
+    steady_max: Annotated[float, spec("m", 0.0, 0.1, "largest error made up for, per axis")] = 0.04
     bandwidth: Annotated[float, spec("rad/s", 1.0, 150.0, "of the joint reference filter")] = 30.0
 
 

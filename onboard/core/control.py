@@ -7,6 +7,7 @@ arm on the base, the base's acceleration in the attitude and joint torques, and 
 
 from __future__ import annotations
 
+from math import cos, sin
 from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Struct
@@ -44,6 +45,8 @@ class State(Struct, frozen=True, gc=False):
     joint_acceleration: Vec3 = (0.0, 0.0, 0.0)
     contact: float = 0.0
     """0 in free flight to 1 with the force loop closed."""
+    steady: float = 0.0
+    """0 to 1: how far the arm makes up for the base's position error."""
 
 
 def step(
@@ -93,7 +96,9 @@ def step(
     roll, pitch, thrust = tilt.attitude_and_thrust(force, rpy[2], params.tilt)
     tilted, roll_acceleration, pitch_acceleration = tilt.step(state.tilt, roll, pitch, params.tilt, dt)
 
-    filtered, joint_acceleration = _arm(state.compensation, estimate, reference, params, dt)
+    change = dt / params.compensation.steady_blend
+    steady = min(1.0, state.steady + change) if reference.steady else max(0.0, state.steady - change)
+    filtered, joint_acceleration = _arm(state.compensation, estimate, reference, steady, params, dt)
     target, target_rate = filtered.joints, filtered.rates
 
     wanted = (tilted.roll, tilted.pitch, reference.yaw)
@@ -154,7 +159,7 @@ def step(
     )
     lift = reference.lift
     return (
-        State(translation, tilted, sliding, filtered, joint_acceleration, contact),
+        State(translation, tilted, sliding, filtered, joint_acceleration, contact, steady),
         Control(
             lift * thrust,
             (lift * torque[0], lift * torque[1], lift * torque[2]),
@@ -170,14 +175,32 @@ def step(
 
 
 def _arm(
-    state: compensation.State | None, estimate: Estimate, reference: Reference, params: AllParams, dt: float
+    state: compensation.State | None,
+    estimate: Estimate,
+    reference: Reference,
+    steady: float,
+    params: AllParams,
+    dt: float,
 ) -> tuple[compensation.State, Vec3]:
     """Joint reference that holds wrist and tool in the world at the measured pitch."""
     arm = params.vehicle.arm
     pitch, pitch_rate = estimate.rpy[1], estimate.rpy_rate[1]
-    x, z, vx, vz = compensation.wrist_in_body(
-        reference.wrist, reference.wrist_rate, (arm.mount[0], arm.mount[2]), pitch, pitch_rate
-    )
+    wrist, wrist_rate = reference.wrist, reference.wrist_rate
+    if steady > 0.0:
+        share, most = steady * params.compensation.steady, params.compensation.steady_max
+        p, v, rp, rv = estimate.p_WB, estimate.v_WB, reference.p, reference.v
+        c, s = cos(reference.yaw), sin(reference.yaw)
+        ahead, up = c * (rp[0] - p[0]) + s * (rp[1] - p[1]), rp[2] - p[2]
+        if abs(ahead) < most and abs(up) < most:
+            wrist_rate = (
+                wrist_rate[0] + share * (c * (rv[0] - v[0]) + s * (rv[1] - v[1])),
+                wrist_rate[1] + share * (rv[2] - v[2]),
+            )
+        wrist = (
+            wrist[0] + share * min(most, max(-most, ahead)),
+            wrist[1] + share * min(most, max(-most, up)),
+        )
+    x, z, vx, vz = compensation.wrist_in_body(wrist, wrist_rate, (arm.mount[0], arm.mount[2]), pitch, pitch_rate)
     theta_1, theta_2, _ = kinematics.nearest_wrist(arm, x, z)
     a, b, c, d = kinematics.wrist_jacobian_inverse(arm, theta_1, theta_2)
     target = (theta_1, theta_2, reference.elevation + pitch)

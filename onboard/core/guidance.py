@@ -224,7 +224,7 @@ def _reference(state: State, params: AllParams, compliant: float, pressing: bool
         (x, y, z), (vx, vy, vz), (ax, ay, az), yaw, yaw_rate, yaw_acceleration, (wx, wz), (vwx, vwz), elevation,
         elevation_rate, pump, own.gripper_open if open_gripper else own.gripper_closed, state.lift, state.force,
         pressing,
-        leg is not None and leg.pumping, compliant, offset.velocity, offset.displacement,
+        leg is not None and leg.pumping, state.phase is Phase.ADHESIVE, compliant, offset.velocity, offset.displacement,
     )  # fmt: skip
 
 

@@ -134,6 +134,8 @@ class Reference(Struct, frozen=True, gc=False):
     """The force loop is closed."""
     dispensing: bool
     """The needle sweeps the arc of the pipe."""
+    steady: bool
+    """The arm makes up for the base's position error, so that the tool follows its path in the world."""
     compliant_acceleration: float
     compliant_velocity: float
     compliant_displacement: float
