@@ -47,7 +47,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     """Gains of the attitude axes and of the joints."""
 
     attitude: Gains = Gains(integral=5.0)
-    joints: Gains = Gains(integral=2.0)
+    joints: Gains = Gains(integral=2.0, reaching=12.0)
 
 
 class State(Struct, frozen=True, gc=False):
