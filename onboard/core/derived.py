@@ -18,6 +18,7 @@ class Derived:
         self.params = params
         self.model = Model.from_vehicle(params.vehicle)
         self.site = plan.survey(params.pipe, params.vehicle, params.plan)
+        plan.check_fence(self.site, params.pipe, params.plan, params.safety.fence_low, params.safety.fence_high)
         self.bounds = limits.bounds(params.vehicle, params.limits)
         gains = params.backstepping
         per_mass = gains.contact_stiffness if gains.compliant else gains.alpha * gains.gamma + 1.0

@@ -123,8 +123,6 @@ def survey(pipe: Pipe, vehicle: Vehicle, params: Params) -> Site:
         raise InfeasibleError(
             "plan.needle_reach / plan.press_reach: the propellers would come closer than 5 cm to the pipe"
         )
-    if hypot(x, y) > 50.0:
-        raise InfeasibleError(f"pipe.position: {hypot(x, y):.0f} m from the start; at most 50 m")
     near_home = _from_pipe((0.0, 0.0, 0.0), (0.0, 0.0, params.takeoff_height), pipe, normal)
     if near_home < params.clearance:
         raise InfeasibleError(
@@ -139,6 +137,18 @@ def survey(pipe: Pipe, vehicle: Vehicle, params: Params) -> Site:
     return Site(
         site.yaw, site.normal, site.crack, site.height, site.far, site.needle, site.near, (angles[0], angles[1])
     )
+
+
+def check_fence(site: Site, pipe: Pipe, params: Params, low: Vec3, high: Vec3) -> None:
+    """Raise ``InfeasibleError`` when the way to the pipe leads out of the box from ``low`` to ``high`` (m, W)."""
+    start: Eight = (0.0, 0.0, params.takeoff_height, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for point in (start[:3], *route(start, beside(site, site.far), pipe, site, params), beside(site, site.needle)):
+        if not all(a <= x <= b for x, a, b in zip(point, low, high, strict=True)):
+            at = ", ".join(f"{x:.1f}" for x in point)
+            raise InfeasibleError(
+                f"pipe.position {pipe.position}: the way to it leads to ({at}) m, outside of the fence from "
+                f"safety.fence_low {low} to safety.fence_high {high}"
+            )
 
 
 def wrist_on_arc(
