@@ -7,6 +7,7 @@ points into the pipe; the base always stands at crack - distance * n, its arm mo
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import cbrt, cos, hypot, inf, pi, radians, sin, sqrt
 from typing import Annotated
 
@@ -123,11 +124,16 @@ def survey(pipe: Pipe, vehicle: Vehicle, params: Params) -> Site:
         raise InfeasibleError(
             "plan.needle_reach / plan.press_reach: the propellers would come closer than 5 cm to the pipe"
         )
-    near_home = _from_pipe((0.0, 0.0, 0.0), (0.0, 0.0, params.takeoff_height), pipe, normal)
-    if near_home < params.clearance:
+    start: Eight = (0.0, 0.0, vehicle.base.gear_height + params.takeoff_height, 0.0, 0.0, 0.0, 0.0, 0.0)
+    over = start[:3]
+    there = ((0.0, 0.0, 0.0), over, *route(start, beside(site, site.far), pipe, site, params))
+    done = beside(site, max(site.near - params.gap + params.retreat, params.clearance))
+    back = (done, *route((*done, 0.0, 0.0, 0.0, 0.0, 0.0), over, pipe, site, params))
+    passes = min(_from_pipe(a, b, pipe, normal) for way in (there, back) for a, b in pairwise(way))
+    if passes < params.clearance:
         raise InfeasibleError(
-            f"pipe.position {pipe.position}: the pipe passes {near_home:.2f} m from the take-off path; "
-            f"at least {params.clearance} m is needed"
+            f"pipe.position {pipe.position}: the way from take-off to the pipe and back passes {passes:.2f} m from its "
+            f"axis; at least {params.clearance} m is needed"
         )
     if not _reaches(params.press_reach, 0.0, vehicle):
         raise InfeasibleError(f"plan.press_reach = {params.press_reach} m: the arm cannot hold the wrist there")
