@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Struct
 
-from drivers.samples import Interface, Vec3
+from drivers.samples import Interface, JointMode, Vec3
 from onboard.core import backstepping, compensation, kinematics, math3, sliding_mode, tilt
 from onboard.core.derived import Derived
 from onboard.core.spec import note, spec
@@ -119,12 +119,12 @@ def step(
         joint_rates[1] - target_rate[1],
         joint_rates[2] - target_rate[2],
     )
-    own_attitude = params.interface is Interface.WRENCH
+    # Where the autopilot or the servos close a loop themselves, ours stays open on those axes: what is left of the
+    # torques is feed-forward, and the joints do not answer to an attitude law that nobody applies.
     sliding, angular, adapted = sliding_mode.step(
         state.sliding,
-        # the autopilot's own loops hold the attitude: then the joints' torques must not answer to our law's wishes
-        error if own_attitude else (0.0, 0.0, 0.0, *error[3:]),
-        error_rate if own_attitude else (0.0, 0.0, 0.0, *error_rate[3:]),
+        _ours(error, params),
+        _ours(error_rate, params),
         (roll_acceleration, pitch_acceleration, reference.yaw_acceleration, *joint_acceleration),
         flying,
         params.sliding_mode,
@@ -172,6 +172,13 @@ def step(
             attitude,
         ),
     )
+
+
+def _ours(error: sliding_mode.Six, params: AllParams) -> sliding_mode.Six:
+    """``error`` on the axes whose loops are closed by our law, 0 on the others."""
+    if params.interface is not Interface.WRENCH:
+        error = (0.0, 0.0, 0.0, *error[3:])
+    return error if params.joints is JointMode.TORQUE else (*error[:3], 0.0, 0.0, 0.0)
 
 
 def _arm(

@@ -7,7 +7,7 @@ desired force and the admittance's displacement along the pipe's normal.
 
 from __future__ import annotations
 
-from math import cos, hypot, sin, sqrt
+from math import cos, hypot, pi, sin, sqrt
 from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Struct
@@ -28,8 +28,15 @@ ZERO: Eight = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 STANDING = (Phase.PREFLIGHT, Phase.STOPPED)
 PRESSING = (Phase.PRESS, Phase.RELEASE)
 BACKING_OUT = (Phase.RETREAT, Phase.RETREAT_HOLD, Phase.RETREAT_LAND)
+#: Between arcs the wrist waits this far back from the middle of the arc, m.
 READY_BACK = 0.06
+#: A leg at constant speed takes up its speed in this time, s.
 SMOOTH_START = 1.0
+#: From this height above the standing height on, the vehicle descends at constant speed, m; the reference goes on
+#: below the ground by as much again, so that the skids are found wherever they are.
+LAST_DESCENT = 0.35
+#: Touched down: the reference is this far below the vehicle (m), which sinks no faster than this (m/s).
+SUNK, SINKING = 0.06, 0.05
 
 
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
@@ -283,7 +290,7 @@ def _plan(phase: Phase, state: State, site: Site, params: AllParams) -> tuple[Le
     if phase is Phase.TAKEOFF:
         path.to(base=(at[0], at[1], state.home[2] + p.takeoff_height))
     elif phase is Phase.APPROACH:
-        ready = (p.needle_reach - READY_BACK, 0.0, -_HALF_TURN)
+        ready = (p.needle_reach - READY_BACK, 0.0, -0.5 * pi)
         for point in plan.route(at, plan.beside(site, site.far), params.pipe, site, p):
             path.to(base=point, arm=ready)
     elif phase is Phase.ALIGN:
@@ -306,8 +313,8 @@ def _plan(phase: Phase, state: State, site: Site, params: AllParams) -> tuple[Le
         path.to(yaw=state.home[3])
     elif phase is Phase.LAND:
         ground = state.home[2]
-        path.to(base=(at[0], at[1], max(ground + 0.35, min(at[2], ground + 0.35))), arm=(*p.fold, 0.0))
-        path.add(_uniform(path.at, (0.0, 0.0, -0.60), p.descent_speed))
+        path.to(base=(at[0], at[1], min(at[2], ground + LAST_DESCENT)), arm=(*p.fold, 0.0))
+        path.add(_uniform(path.at, (0.0, 0.0, -2.0 * LAST_DESCENT), p.descent_speed))
     elif phase is Phase.HOLD:
         vx, vy, vz = state.rate[:3]
         time = max(1.0, 2.0 * hypot(vx, vy, vz) / params.guidance.stop_acceleration)
@@ -340,15 +347,12 @@ def _adhesive(path: Path, site: Site, params: AllParams) -> None:
     sweep(first, last, needle, p.needle_speed * scale, p.pump_ratio * needle * (last - first))
     to(last, clear)
     sweep(last, 0.0, clear, 2.0 * p.arm_speed, 0.0)
-    path.to(arm=(p.needle_reach - READY_BACK, 0.0, -_HALF_TURN))
+    path.to(arm=(p.needle_reach - READY_BACK, 0.0, -0.5 * pi))
 
 
 def _uniform(at: Eight, way: tuple[float, float, float], speed: float) -> Leg:
     target = (at[0] + way[0], at[1] + way[1], at[2] + way[2], *at[3:])
     return Leg(target, hypot(*way) / speed + 0.5 * SMOOTH_START, uniform=True)
-
-
-_HALF_TURN = 1.5707963267948966
 
 
 def _follow(state: State, site: Site, params: AllParams, dt: float) -> State:
@@ -426,4 +430,4 @@ def _near(state: State, estimate: Estimate, params: Params) -> bool:
 
 def _touched_down(state: State, estimate: Estimate) -> bool:
     """The reference has gone well below the vehicle, which no longer sinks: it stands; or it is being spooled down."""
-    return state.lift < 1.0 or (estimate.p_WB[2] - state.at[2] > 0.06 and abs(estimate.v_WB[2]) < 0.05)
+    return state.lift < 1.0 or (estimate.p_WB[2] - state.at[2] > SUNK and abs(estimate.v_WB[2]) < SINKING)

@@ -38,7 +38,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     repair: Repair = Repair()
     interface: Annotated[Interface, note("what the autopilot is sent", in_flight=False)] = Interface.WRENCH
     joints: Annotated[JointMode, note("how the arm's joints are driven", in_flight=False)] = JointMode.TORQUE
-    joint_current: Annotated[float, spec("A", 0.05, 1.8, "current limit of the joints in position mode")] = 1.4
+    joint_current: Annotated[float, spec("A", 0.05, 1.8, "current limit of the joints in position mode")] = 1.6
     dt_min: Annotated[float, spec("s", 1e-4, 0.1, "measured dt is taken to be at least this")] = 0.001
     dt_max: Annotated[float, spec("s", 1e-4, 0.1, "measured dt is taken to be at most this")] = 0.020
 

@@ -65,7 +65,8 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
     autopilot = actuation.autopilot_command(wanted, engage, params.interface)
     # torques for joints that are not seen any more would fling the arm: the servos hold it by themselves
     joints = params.joints if believed.age_servos <= params.safety.servos_late else JointMode.POSITION
-    servos = actuation.servo_command(wanted, reference, joints, params.joint_current)
+    lead = params.vehicle.servo if joints is params.joints else None
+    servos = actuation.servo_command(wanted, reference, joints, params.joint_current, lead)
     permission = facts.permission(task.phase, engage, believed, aloft)
     gate, autopilot, servos, clipped = limits.step(
         state.limits, autopilot, servos, permission, facts.measured(seen), derived.bounds, dt
