@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
 
+from onboard.config import load_config
+from tests.bench import compare
 from tests.bench.__main__ import main
 from tests.bench.table import WIDTH
 
@@ -32,6 +35,18 @@ def test_a_short_run_fills_the_table(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert max(map(len, text.split("\nThe same")[0].splitlines())) <= WIDTH
     for name in ("whole step", "dynamics", "limits", "recorder", "fuzzy law", "mass matrix"):
         assert name in text
+
+
+def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compare, "version", _not_installed)
+    config = load_config()
+    rows = compare.compare(config.fuzzy, config.vehicle)
+    assert {row.name for row in rows} == {"fuzzy law", "inverse dynamics", "mass matrix"}
+    assert all(row.ratio is None and "is not installed" in row.package for row in rows)
+
+
+def _not_installed(distribution: str) -> str:
+    raise PackageNotFoundError(distribution)
 
 
 @pytest.mark.parametrize(
