@@ -60,6 +60,8 @@ def step(
     dt: float,
 ) -> tuple[State, Control]:
     """One tick of the laws. flying: off the ground (the laws adapt); near_pipe: the tip is at the pipe."""
+    if reference.lift == 0.0:  # on the ground with the motors off: nothing of the last flight is remembered
+        state = State(compensation=state.compensation)
     own, model = params.control, derived.model
     p, v, rpy, rpy_rate = estimate.p_WB, estimate.v_WB, estimate.rpy, estimate.rpy_rate
     joints, joint_rates = estimate.joints, estimate.joint_rates

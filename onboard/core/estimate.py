@@ -130,7 +130,10 @@ def step(
         odometry.p_WB[2] + shift[2] + ahead * v[2],
     )
     joints, rates = servos.position[:3], servos.velocity[:3]
-    payload = state.payload and not (phase is Phase.RELEASE and servos.position[4] > params.estimate.released_at)
+    # before a flight the gripper is loaded with a sleeve
+    payload = phase is Phase.PREFLIGHT or (
+        state.payload and not (phase is Phase.RELEASE and servos.position[4] > params.estimate.released_at)
+    )
 
     desired = reference.a if reference is not None else (0.0, 0.0, 0.0)
     watched = observer.step(

@@ -238,8 +238,13 @@ def _reference(state: State, params: AllParams, compliant: float, pressing: bool
 def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived: Derived, params: AllParams) -> State:
     """The state with the plan of ``phase``, begun where the reference is."""
     before, site = state.phase, derived.site
-    if before in STANDING or phase in STANDING:
-        state = _start_from(replace(state, released_for=0.0), measured(estimate, pump, params.vehicle))
+    if phase in STANDING:
+        # nothing of the last flight is left but the gripper, which stays open until the next preflight
+        released_for = state.released_for if phase is Phase.STOPPED else 0.0
+        here = measured(estimate, pump, params.vehicle)
+        return replace(initial(), phase=phase, at=here, home=here, released_for=released_for)
+    if before in STANDING:
+        state = _start_from(state, measured(estimate, pump, params.vehicle))
     force = state.force
     easing = -1.0
     if phase is Phase.PRESS:
