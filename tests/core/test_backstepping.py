@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from math import cos, isfinite, sin
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.samples import Vec3
 from onboard.core import backstepping
 from onboard.core.backstepping import Params, State
 from tests.core.strategies import number, vector
@@ -16,8 +18,22 @@ MASS, WEIGHT, DT = 2.4, 23.5, 0.004
 PRINTED = Params(compliant=False, freeze_in_contact=False, feed_forward=0.0, leak=0.0)
 
 
-def law(state=State(), error=(0.0, 0.0, 0.0), rate=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, 0.0), heading=0.0,
-        contact=0.0, adapt=True, hold=False, force=0.0, params=PRINTED):  # fmt: skip
+START = State()
+ZERO: Vec3 = (0.0, 0.0, 0.0)
+
+
+def law(
+    state: State = START,
+    error: Vec3 = ZERO,
+    rate: Vec3 = ZERO,
+    acceleration: Vec3 = ZERO,
+    heading: float = 0.0,
+    contact: float = 0.0,
+    adapt: bool = True,
+    hold: bool = False,
+    force: float = 0.0,
+    params: Params = PRINTED,
+) -> tuple[State, Vec3, Vec3]:
     normal = (cos(heading), sin(heading))
     return backstepping.step(
         state, error, rate, acceleration, MASS, WEIGHT, normal, contact, adapt, hold, force, params, DT
@@ -25,7 +41,7 @@ def law(state=State(), error=(0.0, 0.0, 0.0), rate=(0.0, 0.0, 0.0), acceleration
 
 
 @given(vector(2.0), vector(2.0), vector(3.0), vector(3.0))
-def test_is_equations_2_and_3(error, rate, acceleration, disturbance):
+def test_is_equations_2_and_3(error: Vec3, rate: Vec3, acceleration: Vec3, disturbance: Vec3) -> None:
     p = PRINTED
     alpha, gamma = (p.alpha, p.alpha, p.alpha_z), (p.gamma, p.gamma, p.gamma_z)
     _, force, v = law(State(disturbance), error, rate, acceleration, adapt=False)
@@ -36,7 +52,7 @@ def test_is_equations_2_and_3(error, rate, acceleration, disturbance):
         assert force[i] == pytest.approx(MASS * expected + disturbance[i] + (WEIGHT if i == 2 else 0.0), abs=1e-9)
 
 
-def test_adaptation_opposes_the_augmented_error_and_is_bounded():
+def test_adaptation_opposes_the_augmented_error_and_is_bounded() -> None:
     state, _, _ = law(error=(0.1, 0.0, -0.2))
     assert state.disturbance[0] < 0.0 < state.disturbance[2]
     assert state.disturbance[0] == pytest.approx(-PRINTED.beta * PRINTED.alpha * 0.1 * DT)
@@ -45,7 +61,7 @@ def test_adaptation_opposes_the_augmented_error_and_is_bounded():
     assert state.disturbance == (-PRINTED.bound, 0.0, PRINTED.bound)
 
 
-def test_leak_forgets():
+def test_leak_forgets() -> None:
     state = State((1.0, 0.0, 0.0))
     for _ in range(1000):
         state, _, _ = law(state, params=Params(leak=0.5))
@@ -53,16 +69,18 @@ def test_leak_forgets():
 
 
 @given(vector(1e6), vector(1e6), vector(1e6), number(3.2), st.floats(0.0, 1.0), st.booleans(), number(10.0))
-def test_finite_in_finite_out(error, rate, acceleration, heading, contact, hold, force):
+def test_finite_in_finite_out(
+    error: Vec3, rate: Vec3, acceleration: Vec3, heading: float, contact: float, hold: bool, force: float
+) -> None:
     state, tau, v = law(State(), error, rate, acceleration, heading, contact, True, hold, force, Params())
     assert all(isfinite(x) for x in (*tau, *v, *state.disturbance))
     assert all(abs(x) <= Params().bound for x in state.disturbance)
 
 
 @given(vector(1.0), vector(1.0), vector(1.0), number(3.2), st.floats(0.0, 1.0))
-def test_is_odd_but_for_the_weight(error, rate, acceleration, heading, contact):
-    def flip(v):
-        return tuple(-x for x in v)
+def test_is_odd_but_for_the_weight(error: Vec3, rate: Vec3, acceleration: Vec3, heading: float, contact: float) -> None:
+    def flip(v: Vec3) -> Vec3:
+        return (-v[0], -v[1], -v[2])
 
     _, tau, _ = law(
         error=error, rate=rate, acceleration=acceleration, heading=heading, contact=contact, params=Params()
@@ -81,7 +99,7 @@ def test_is_odd_but_for_the_weight(error, rate, acceleration, heading, contact):
 
 @given(number(3.2))
 @settings(max_examples=30)
-def test_compliance_acts_along_the_normal_alone(heading):
+def test_compliance_acts_along_the_normal_alone(heading: float) -> None:
     p = Params(contact_stiffness=0.5, contact_damping=0.7)
     n, t = (cos(heading), sin(heading)), (-sin(heading), cos(heading))
     _, along, _ = law(error=(0.1 * n[0], 0.1 * n[1], 0.0), heading=heading, contact=1.0, adapt=False, params=p)
@@ -90,17 +108,19 @@ def test_compliance_acts_along_the_normal_alone(heading):
     assert across[0] * t[0] + across[1] * t[1] == pytest.approx(-MASS * (p.alpha * p.gamma + 1.0) * 0.1)
 
 
-def test_adaptation_rests_along_the_normal_at_the_pipe():
+def test_adaptation_rests_along_the_normal_at_the_pipe() -> None:
     state, _, _ = law(error=(0.1, 0.2, 0.0), hold=True, params=Params(freeze_in_contact=True))
-    assert state.disturbance[0] == 0.0 and state.disturbance[1] < 0.0
+    assert state.disturbance[0] == 0.0
+    assert state.disturbance[1] < 0.0
 
 
-def test_the_desired_force_is_fed_forward_along_the_normal():
+def test_the_desired_force_is_fed_forward_along_the_normal() -> None:
     _, tau, _ = law(heading=0.5, contact=1.0, force=2.0, params=Params(feed_forward=1.0))
-    assert tau[0] == pytest.approx(2.0 * cos(0.5)) and tau[1] == pytest.approx(2.0 * sin(0.5))
+    assert tau[0] == pytest.approx(2.0 * cos(0.5))
+    assert tau[1] == pytest.approx(2.0 * sin(0.5))
 
 
-def test_turning_compliant_is_continuous():
+def test_turning_compliant_is_continuous() -> None:
     """No jump at take-over: a small change of the blend changes the force a little."""
     forces = [law(error=(0.05, 0.0, 0.0), contact=c / 100.0, force=0.2, params=Params())[1][0] for c in range(101)]
-    assert max(abs(a - b) for a, b in zip(forces, forces[1:], strict=False)) < 0.02
+    assert max(abs(a - b) for a, b in itertools.pairwise(forces)) < 0.02

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from math import exp, isfinite
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.samples import Vec3
 from onboard.core import admittance, contact_trigger, force_profile, observer
 from tests.core.strategies import number, vector
 
@@ -17,7 +19,7 @@ DT = 0.004
 # --- admittance -------------------------------------------------------------------------------------------------------
 
 
-def test_admittance_integrates_twice_when_undamped():
+def test_admittance_integrates_twice_when_undamped() -> None:
     p = admittance.Params(damping=0.0)
     state = admittance.State()
     for _ in range(500):
@@ -27,7 +29,7 @@ def test_admittance_integrates_twice_when_undamped():
 
 
 @given(st.lists(number(5.0), min_size=1, max_size=60))
-def test_admittance_is_bounded_odd_and_does_not_wind_up(accelerations):
+def test_admittance_is_bounded_odd_and_does_not_wind_up(accelerations: list[float]) -> None:
     p = admittance.Params()
     state, mirror = admittance.State(), admittance.State()
     for a in accelerations:
@@ -35,7 +37,8 @@ def test_admittance_is_bounded_odd_and_does_not_wind_up(accelerations):
             state, applied = admittance.step(state, a, p, DT)
             mirror, _ = admittance.step(mirror, -a, p, DT)
             assert isfinite(applied)
-            assert abs(state.displacement) <= p.displacement_max and abs(state.velocity) <= p.velocity_max
+            assert abs(state.displacement) <= p.displacement_max
+            assert abs(state.velocity) <= p.velocity_max
             assert mirror.displacement == pytest.approx(-state.displacement, abs=1e-12)
     for _ in range(5):
         state, _ = admittance.step(admittance.State(p.displacement_max, 0.0), -0.5, p, DT)
@@ -45,13 +48,20 @@ def test_admittance_is_bounded_odd_and_does_not_wind_up(accelerations):
 # --- observer ---------------------------------------------------------------------------------------------------------
 
 MASS, G = 2.4, 9.80665
+REST = observer.State()
 
 
-def observe(force, params, desired=(0.0, 0.0, 0.0), seconds=2.0, state=observer.State(), axis=(0.0, 0.0, 1.0)):
+def observe(
+    force: Vec3,
+    params: observer.Params,
+    desired: Vec3 = (0.0, 0.0, 0.0),
+    seconds: float = 2.0,
+    state: observer.State = REST,
+    axis: Vec3 = (0.0, 0.0, 1.0),
+) -> observer.State:
     thrust = MASS * G
-    measured = tuple(
-        thrust * a / MASS + f / MASS - (G if i == 2 else 0.0) for i, (a, f) in enumerate(zip(axis, force, strict=True))
-    )
+    ax, ay, az = (thrust * a / MASS + f / MASS for a, f in zip(axis, force, strict=True))
+    measured = (ax, ay, az - G)
     for _ in range(round(seconds / DT)):
         state = observer.step(state, measured, desired, thrust, axis, MASS, G, params, DT)
     return state
@@ -59,13 +69,13 @@ def observe(force, params, desired=(0.0, 0.0, 0.0), seconds=2.0, state=observer.
 
 @given(vector(5.0), st.floats(-0.3, 0.3))
 @settings(max_examples=30)
-def test_observer_reads_the_external_force_at_any_tilt(force, lean):
+def test_observer_reads_the_external_force_at_any_tilt(force: Vec3, lean: float) -> None:
     axis = (lean, 0.0, (1.0 - lean * lean) ** 0.5)
     state = observe(force, observer.Params(), axis=axis)
     assert observer.external_force(state, observer.Params()) == pytest.approx(force, abs=1e-6)
 
 
-def test_observer_filter_is_equation_14():
+def test_observer_filter_is_equation_14() -> None:
     p = observer.Params(cutoff=20.0)
     state = observe((1.0, 0.0, 0.0), p, seconds=DT)
     assert state.force[0] == pytest.approx(20.0 * DT / (1.0 + 20.0 * DT))
@@ -73,7 +83,7 @@ def test_observer_filter_is_equation_14():
     assert state.force[0] == pytest.approx(1.0 - exp(-2.0), abs=0.02)
 
 
-def test_printed_form_reads_the_desired_acceleration_as_force():
+def test_printed_form_reads_the_desired_acceleration_as_force() -> None:
     """What eq. 11 does in motion, and why the other form is the default."""
     moving = (0.5, -0.25, 0.3)
     printed = observe((0.0, 0.0, 0.0), observer.Params(desired_acceleration=True), moving)
@@ -82,7 +92,7 @@ def test_printed_form_reads_the_desired_acceleration_as_force():
     assert plain.force == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
-def test_tare_removes_what_is_read_in_hover():
+def test_tare_removes_what_is_read_in_hover() -> None:
     p = observer.Params()
     state = observe((0.1, -0.05, 0.2), p)
     for _ in range(100):
@@ -93,7 +103,7 @@ def test_tare_removes_what_is_read_in_hover():
     assert observer.external_force(state, observer.Params(tare=False)) == pytest.approx((0.1, -0.05, 0.2), abs=1e-6)
 
 
-def test_thrust_lag_delays_the_model():
+def test_thrust_lag_delays_the_model() -> None:
     p = observer.Params(thrust_lag=0.04, cutoff=200.0)
     state = observer.step(
         observer.State(thrust=20.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 24.0, (0.0, 0.0, 1.0), MASS, G, p, DT
@@ -102,7 +112,7 @@ def test_thrust_lag_delays_the_model():
 
 
 @given(vector(1e4), vector(1e4), st.floats(0.0, 60.0))
-def test_observer_is_finite(acceleration, desired, thrust):
+def test_observer_is_finite(acceleration: Vec3, desired: Vec3, thrust: float) -> None:
     state = observer.step(
         observer.State(), acceleration, desired, thrust, (0.1, 0.0, 0.99), MASS, G, observer.Params(), DT
     )
@@ -112,15 +122,16 @@ def test_observer_is_finite(acceleration, desired, thrust):
 # --- contact trigger --------------------------------------------------------------------------------------------------
 
 T = contact_trigger.Params()
+NO_CONTACT = contact_trigger.State()
 
 
-def run(pairs, state=contact_trigger.State()):
+def run(pairs: list[tuple[float, float]], state: contact_trigger.State = NO_CONTACT) -> contact_trigger.State:
     for distance, force in pairs:
         state = contact_trigger.step(state, distance, force, T, DT)
     return state
 
 
-def test_trigger_wants_place_and_force_for_the_debounce():
+def test_trigger_wants_place_and_force_for_the_debounce() -> None:
     n = round(T.debounce / DT) + 1
     assert run([(0.0, 1.0)] * n).contact
     assert not run([(0.0, 1.0)] * (n - 2)).contact
@@ -129,7 +140,7 @@ def test_trigger_wants_place_and_force_for_the_debounce():
     assert not run(([(0.0, 1.0)] * (n - 2) + [(0.0, 0.0)]) * 5).contact, "an interruption starts the debounce again"
 
 
-def test_trigger_lets_go_only_after_its_time():
+def test_trigger_lets_go_only_after_its_time() -> None:
     held = contact_trigger.State(True)
     n = round(T.lost_time / DT) + 1
     assert run([(0.0, 0.0)] * (n - 2), held).contact
@@ -142,17 +153,20 @@ def test_trigger_lets_go_only_after_its_time():
 
 @given(st.floats(0.5, 4.0), st.floats(0.5, 60.0), st.floats(0.0, 2.0))
 @settings(max_examples=25)
-def test_profile_is_smooth_bounded_and_ends_at_the_bias(force, hold, start):
+def test_profile_is_smooth_bounded_and_ends_at_the_bias(force: float, hold: bool, start: float) -> None:
     p = force_profile.Params()
     total = p.settle + 2.0 * p.bias_hold + 2.0 * p.ramp + hold
     dt = 0.01
     values = [force_profile.desired_force(k * dt, start, force, hold, p) for k in range(round(total / dt) + 3)]
     f = [v for v, _ in values]
     assert f[0] == start
-    assert min(f) >= min(start, p.bias, force) - 1e-12 and max(f) <= max(start, p.bias, force) + 1e-12
+    assert min(f) >= min(start, p.bias, force) - 1e-12
+    assert max(f) <= max(start, p.bias, force) + 1e-12
     fastest = 15.0 / 8.0 * max(abs(force - p.bias) / p.ramp, abs(start - p.bias) / p.settle)
-    assert max(abs(a - b) for a, b in zip(f, f[1:], strict=False)) <= fastest * dt * 1.01 + 1e-12
-    assert values[-1] == (pytest.approx(p.bias), True)
+    assert max(abs(a - b) for a, b in itertools.pairwise(f)) <= fastest * dt * 1.01 + 1e-12
+    last, ended = values[-1]
+    assert ended
+    assert last == pytest.approx(p.bias)
     assert not values[round((total - 0.1) / dt)][1]
     middle = p.settle + p.bias_hold + p.ramp + 0.5 * hold
     assert force_profile.desired_force(middle, start, force, hold, p)[0] == pytest.approx(force)
