@@ -265,13 +265,28 @@ def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived:
         elif before in PRESSING or state.easing >= 0.0:
             state = _start_from(state, _base_measured(state.at, estimate))
             state = replace(state, admittance=admittance.State())
-    state = replace(state, phase=phase, force=force, easing=easing, settled=0.0, clock=0.0, index=0, time=0.0)
+    state = replace(state, phase=phase, force=force, easing=easing, settled=0.0, clock=0.0)
     if phase is Phase.RELEASE or easing >= 0.0:
-        return replace(state, legs=())
+        return replace(state, legs=(), index=0, time=0.0)
+    stop = _stop_time(state, params)
+    if phase is Phase.HOLD and state.index < len(state.legs):
+        leg = state.legs[state.index]
+        if not leg.uniform and leg.duration - state.time <= stop:
+            return replace(state, legs=(leg,), index=0)  # it comes to rest sooner, and nearer, than it could be stopped
     state = replace(
-        state, start=state.at, start_rate=state.rate, start_acceleration=state.acceleration, moving=any(state.rate)
-    )
-    return replace(state, legs=_plan(phase, state, site, params))
+        state, start=state.at, start_rate=state.rate, start_acceleration=state.acceleration, moving=any(state.rate),
+        index=0, time=0.0,
+    )  # fmt: skip
+    legs = _plan(phase, state, site, params)
+    if state.moving and legs and legs[0].duration < stop:
+        legs = (replace(legs[0], duration=stop), *legs[1:])  # a short leg must not make the way out of motion hard
+    return replace(state, legs=legs)
+
+
+def _stop_time(state: State, params: AllParams) -> float:
+    """Time in which a motion is broken off, s."""
+    vx, vy, vz = state.rate[:3]
+    return max(1.0, 2.0 * hypot(vx, vy, vz) / params.guidance.stop_acceleration)
 
 
 def _start_from(state: State, at: Eight) -> State:
@@ -321,8 +336,7 @@ def _plan(phase: Phase, state: State, site: Site, params: AllParams) -> tuple[Le
         path.to(base=(at[0], at[1], min(at[2], ground + LAST_DESCENT)), arm=(*p.fold, 0.0))
         path.add(_uniform(path.at, (0.0, 0.0, -2.0 * LAST_DESCENT), p.descent_speed))
     elif phase is Phase.HOLD:
-        vx, vy, vz = state.rate[:3]
-        time = max(1.0, 2.0 * hypot(vx, vy, vz) / params.guidance.stop_acceleration)
+        time = _stop_time(state, params)
         target = tuple(a + 0.5 * time * v for a, v in zip(at, state.rate, strict=True))
         path.add(Leg(target, time))  # type: ignore[arg-type]
     return path.legs
