@@ -86,7 +86,7 @@ def step(
             jump = hypot(*leap)
             reset = new.reset_counter != odometry.reset_counter
             brief = new.t_ns - odometry.t_ns <= params.estimate.extrapolate_max * 1e9
-            if brief and (reset or jump > params.safety.odometry_jump):
+            if brief and phase is not Phase.PREFLIGHT and (reset or jump > params.safety.odometry_jump):
                 shift = (shift[0] - leap[0], shift[1] - leap[1], shift[2] - leap[2])
             odometry = new
     told = inputs.autopilot
