@@ -13,11 +13,12 @@ from pathlib import Path
 from drivers.mailbox import Level
 from onboard.clock import WallClock
 from onboard.config import Config, dump_config
-from onboard.core.types import Event, Outputs, Phase, Request, Severity
+from onboard.core.types import Event, Outputs, Request, Severity
 from onboard.devices import DeskDevices
+from onboard.errand import Errand
 from onboard.loop import Loop
 from onboard.recorder import Recorder
-from onboard.simulate import START_AT, TruthSink, run_info
+from onboard.simulate import TruthSink, run_info
 
 #: Severity of a driver's notice in the log.
 _SEVERITY = {Level.INFO: Severity.INFO, Level.WARNING: Severity.WARNING, Level.ERROR: Severity.ERROR}
@@ -46,13 +47,8 @@ async def fly(
         try:
             await devices.start()
             loop = Loop(devices, clock, config, TruthSink(recorder, devices.world), timed=True)
-            asked: list[Request] = []
+            errand = Errand(loop.request, duration + LONGEST)
             first = clock.now_ns()
-
-            def ask(request: Request) -> None:
-                if request not in asked:
-                    asked.append(request)
-                    loop.request(request)
 
             def on_tick(outputs: Outputs) -> bool:
                 t = (clock.now_ns() - first) * 1e-9
@@ -60,12 +56,9 @@ async def fly(
                 for notice in devices.notices():
                     recorder.event(Event(notice.t_ns, "autopilot", _SEVERITY[notice.level], notice.text))
                     say(notice.text)
-                if t >= START_AT and outputs.phase is Phase.PREFLIGHT and not outputs.verdict.reasons:
-                    ask(Request.START)
                 if t >= duration:
-                    ask(Request.LAND)
-                ended = outputs.phase is Phase.STOPPED or devices.world.truth().crashed
-                return not ended and t < duration + LONGEST
+                    errand.ask_once(Request.LAND)
+                return errand.goes_on(outputs, t) and not devices.world.truth().crashed
 
             # what lives by now lives to the end: the collector need not look at it in flight
             gc.collect()

@@ -36,7 +36,7 @@ def mock_devices(world: World) -> DeviceSet:
 
 
 class DeskDevices(DeviceSet):
-    """The real PX4 driver over UDP on loopback to a stand-in, which moves the world on the wall clock; the rest mock."""
+    """The real PX4 driver over UDP on loopback to a stand-in that moves the world on the wall clock; the rest mock."""
 
     def __init__(self, config: Config) -> None:
         self.world = world_of(config)

@@ -9,16 +9,15 @@ from pathlib import Path
 from onboard.clock import VirtualClock
 from onboard.config import Config, dump_config
 from onboard.core.step import State
-from onboard.core.types import Outputs, Phase, Request, Tick
+from onboard.core.types import Outputs, Tick
 from onboard.devices import mock_devices, world_of
+from onboard.errand import Errand
 from onboard.loop import Loop
 from onboard.recorder import Recorder
 from onboard.records import RunInfo, Timing
 from onboard.version import version
 from sim_backend.world import World
 
-#: Rest on the ground before the start is asked for, s.
-START_AT = 0.4
 #: A mission that has not ended by then is broken off, s of simulated time.
 LONGEST = 900.0
 
@@ -56,15 +55,12 @@ def simulate(config: Config, log: Path, watch: Callable[[Outputs, float], None] 
     clock = VirtualClock(world.advance)
     with Recorder(log, run_info(config), config, dump_config(config)) as recorder:
         loop = Loop(mock_devices(world), clock, config, TruthSink(recorder, world))
+        errand = Errand(loop.request, LONGEST)
 
         def on_tick(outputs: Outputs) -> bool:
             t = clock.now_ns() * 1e-9
             if watch is not None:
                 watch(outputs, t)
-            if outputs.phase is Phase.PREFLIGHT and t >= START_AT and not asked:
-                asked.append(t)
-                loop.request(Request.START)
-            return outputs.phase is not Phase.STOPPED and not world.truth().crashed and t < LONGEST
+            return errand.goes_on(outputs, t) and not world.truth().crashed
 
-        asked: list[float] = []
         asyncio.run(loop.run(on_tick))

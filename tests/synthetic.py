@@ -197,6 +197,7 @@ def _cycle(index: int, phase: Phase, phase_time: float, share: float) -> tuple[T
         force=force,
         pressing=pressing,
         dispensing=dispensing,
+        steady=dispensing,
         compliant_acceleration=0.0,
         compliant_velocity=0.0,
         compliant_displacement=0.0,

@@ -11,10 +11,11 @@ from onboard import simulate as simulating
 from onboard.config import Config, load_config
 from onboard.core.types import Outputs, Phase, Request
 from onboard.devices import world_of
+from onboard.errand import START_AT
 from onboard.layers import Layer
 from onboard.logfile import LogReader
 from onboard.params import compose
-from onboard.simulate import START_AT, simulate
+from onboard.simulate import simulate
 from sim_backend import layout as at
 from sim_backend.world import World
 
