@@ -5,6 +5,8 @@ from __future__ import annotations
 from math import hypot
 from typing import TYPE_CHECKING
 
+from msgspec.structs import replace
+
 from drivers.samples import Engage, FlightMode, Landed
 from onboard.core import limits, math3, mission, safety
 from onboard.core.guidance import Progress
@@ -19,7 +21,15 @@ if TYPE_CHECKING:
 #: Rise above the place of takeoff that counts as flying, m.
 LIFT_OFF = 0.05
 _CONTACT = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE, Phase.RETREAT, Phase.RETREAT_HOLD, Phase.RETREAT_LAND)
-_NO_POSITION = (0.0, 0.0, 0.0)
+_DEVICES = ("odometry", "autopilot", "servos")
+#: Of a vehicle on the ground of which nothing is known yet.
+_NOTHING_AMISS = safety.Facts(
+    phase=Phase.PREFLIGHT, airborne=False, armed=False, contact_expected=False, pressing=False, age_odometry=0.0,
+    age_autopilot=0.0, age_servos=0.0, odometry_jump=0.0, odometry_reset=False, confidence=3.0, tilt=0.0,
+    position=(0.0, 0.0, 0.0), contact_force=0.0, free_flight_force=0.0, servo_error=0, temperature=25.0,
+    servo_voltage_min=5.0, servo_voltage_max=5.0, torque_on=True, joint_error=0.0, battery_voltage=16.0,
+    battery_remaining=1.0, dt=0.0, inputs_finite=True, offboard_lost=False,
+)  # fmt: skip
 
 
 def airborne(
@@ -44,11 +54,18 @@ def for_safety(
     """Facts of one tick. arm: the joint reference."""
     odometry, autopilot, servos = seen.odometry, seen.autopilot, seen.servos
     if odometry is None or autopilot is None or servos is None:
-        return safety.Facts(
-            phase, flying, False, False, False, believed.age_odometry, believed.age_autopilot, believed.age_servos,
-            0.0, False, 0.0 if odometry is None else odometry.confidence, 0.0, _NO_POSITION, 0.0, 0.0, 0, 0.0,
-            5.0, 5.0, True, 0.0, 99.0, 1.0, inputs.dt, seen.finite, False,
-        )  # fmt: skip
+        return replace(
+            _NOTHING_AMISS,
+            phase=phase,
+            age_odometry=0.0 if odometry is None else believed.age_odometry,
+            age_autopilot=0.0 if autopilot is None else believed.age_autopilot,
+            age_servos=0.0 if servos is None else believed.age_servos,
+            dt=inputs.dt,
+            inputs_finite=seen.finite,
+            missing=", ".join(
+                name for name, told in zip(_DEVICES, (odometry, autopilot, servos), strict=True) if told is None
+            ),
+        )
     f = believed.force_W
     now = believed.joints
     joints = arm.joints if arm is not None else now

@@ -152,6 +152,8 @@ class Facts(Struct, frozen=True, gc=False):
     """The autopilot was in offboard and has left it without being asked; true in that tick, or from then on."""
     disagreement: float = 0.0
     """Angle between the verticals of odometry and autopilot, rad."""
+    missing: str = ""
+    """Names of the devices that have not told anything yet; their ages count as 0."""
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
@@ -239,6 +241,8 @@ TABLE: Final[tuple[Condition, ...]] = (
     Condition("non_finite", lambda f, p: _finite(f), None, WARNS, WELL),
     Condition("non_finite_sustained", lambda f, p: _finite(f), "non_finite_time", LANDS, LATCHED),
 
+    Condition("devices_missing", lambda f, p: not f.missing, None, WARNS, WELL),
+
     Condition("odometry_late", lambda f, p: abs(f.age_odometry) <= p.odometry_late, None, HOLDS, WELL),
     Condition("odometry_lost", lambda f, p: abs(f.age_odometry) <= p.odometry_lost, None, LANDS, LATCHED),
     Condition("odometry_jump", lambda f, p: f.odometry_jump <= p.odometry_jump, None, HOLDS, WELL),
@@ -305,6 +309,11 @@ WORDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType({
     "non_finite_sustained": (
         "any value is not finite, sustained",
         "Values are not finite: landing by the autopilot. Take over if you can.",
+    ),
+
+    "devices_missing": (
+        "a device has not told anything yet",
+        "Waiting for the first word of: {f.missing}. Check power and cables if this stays.",
     ),
 
     "odometry_late": (
