@@ -88,13 +88,21 @@ def test_a_healthy_hover_is_no_danger() -> None:
 
 
 @pytest.mark.parametrize("missing", ["odometry", "autopilot", "servos"])
-def test_before_the_first_samples_there_are_only_ages(missing: str) -> None:
+def test_before_its_first_sample_a_device_is_missing_and_that_is_all(missing: str) -> None:
     seen = replace(SEEN, **{missing: None})
     believed = replace(HIGH, **{f"age_{missing}": inf})
     told = dangers(seen, believed, Phase.PREFLIGHT, flying=False)
-    _, verdict, _ = safety.step(safety.initial(), told, CONFIG.safety, 1.0)
-    assert verdict.action is Action.WARN
-    assert verdict.reasons[0].startswith(missing)
+    assert told.missing == missing
+    _, verdict, said = safety.step(safety.initial(), told, CONFIG.safety, 1.0)
+    assert verdict == Verdict(Action.WARN, ("devices_missing",))
+    assert missing in said[0][2]
+
+
+def test_the_devices_that_have_told_something_are_watched_meanwhile() -> None:
+    old = replace(HIGH, age_odometry=CONFIG.safety.odometry_lost + 0.1, age_servos=inf)
+    told = dangers(replace(SEEN, servos=None, finite=False), old, Phase.PREFLIGHT, flying=False)
+    _, verdict, _ = safety.step(safety.initial(), told, CONFIG.safety, 0.004)
+    assert {"devices_missing", "odometry_late", "odometry_lost", "non_finite"} <= set(verdict.reasons)
 
 
 @pytest.mark.parametrize("phase", Phase)
