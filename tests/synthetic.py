@@ -195,6 +195,7 @@ def _cycle(index: int, phase: Phase, phase_time: float, share: float) -> tuple[T
         gripper=0.0,
         lift=0.0 if grounded else 1.0,
         force=force,
+        force_ahead=force,
         pressing=pressing,
         dispensing=dispensing,
         steady=dispensing,

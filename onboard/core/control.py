@@ -83,7 +83,7 @@ def step(
         contact,
         flying,
         near_pipe,
-        reference.force,
+        reference.force_ahead,
         params.backstepping,
         dt,
     )

@@ -20,6 +20,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     settle: Annotated[float, spec("s", 0.1, 20.0, "time from the trigger to the bias")] = 1.0
     bias_hold: Annotated[float, spec("s", 0.0, 20.0, "time at the bias before the ramp and after it")] = 1.0
     ramp: Annotated[float, spec("s", 0.5, 60.0, "duration of each quintic ramp")] = 6.0
+    lead: Annotated[float, spec("s", 0.0, 1.0, "lead of the force fed forward, for the attitude's lag")] = 0.11
 
 
 def quintic(u: float) -> float:

@@ -140,13 +140,13 @@ def step(
     """
     own, site = params.guidance, derived.site
     if not estimate.valid:
-        return state, _reference(state, params, 0.0, False), Progress()
+        return state, _reference(state, params, 0.0, 0.0, False), Progress()
     if phase is not state.phase:
         state = _enter(state, phase, estimate, pump, derived, params)
     if phase in STANDING:
         here: Eight = (*measured(estimate, pump, params.vehicle)[:4], *state.at[4:])
         state = replace(state, at=here, home=here)
-        return state, _reference(state, params, 0.0, False), Progress()
+        return state, _reference(state, params, 0.0, 0.0, False), Progress()
 
     lift, easing, clock, settled = state.lift, state.easing, state.clock, state.settled
     if phase is Phase.TAKEOFF:
@@ -158,26 +158,23 @@ def step(
     if phase is Phase.LAND and _touched_down(state, estimate):
         lift = max(0.0, lift - dt / params.plan.spool)
 
-    force, pressing, pressed = state.force, phase in PRESSING, False
-    press_time = state.press_time
+    force, ahead, pressing, pressed = 0.0, 0.0, phase in PRESSING, False
+    press_time, lead = state.press_time, params.force_profile.lead
     if phase is Phase.PRESS:
         press_time += dt
-        force, pressed = force_profile.desired_force(
-            press_time, state.press_start, params.repair.force, params.repair.hold, params.force_profile
-        )
+        force, pressed = _profile(press_time, state, params)
+        ahead, _ = _profile(press_time + lead, state, params)
     elif phase is Phase.RELEASE:
-        force = params.force_profile.bias
+        force = ahead = params.force_profile.bias
     elif easing >= 0.0:
         easing += dt
         if easing < own.force_down:
             pressing, paused = True, True
-            force = state.press_start * (1.0 - force_profile.quintic(easing / own.force_down))
+            force, ahead = _taken_back(easing, state, own), _taken_back(easing + lead, state, own)
         else:
             state = replace(_start_from(state, _base_measured(state.at, estimate)), press_start=0.0)
             state = replace(state, legs=_plan(phase, state, site, params))
-            easing, force = -1.0, 0.0
-    else:
-        force = 0.0
+            easing = -1.0
 
     ended = state.index >= len(state.legs)
     if not ended and not paused:
@@ -211,10 +208,19 @@ def step(
         taring and clock >= own.tare_settle + own.tare_time,
         phase is Phase.LAND and lift <= 0.0,
     )
-    return state, _reference(state, params, acceleration, pressing), progress
+    return state, _reference(state, params, acceleration, ahead, pressing), progress
 
 
-def _reference(state: State, params: AllParams, compliant: float, pressing: bool) -> Reference:
+def _profile(t: float, state: State, params: AllParams) -> tuple[float, bool]:
+    repair = params.repair
+    return force_profile.desired_force(t, state.press_start, repair.force, repair.hold, params.force_profile)
+
+
+def _taken_back(t: float, state: State, params: Params) -> float:
+    return state.press_start * (1.0 - force_profile.quintic(t / params.force_down))
+
+
+def _reference(state: State, params: AllParams, compliant: float, force_ahead: float, pressing: bool) -> Reference:
     x, y, z, yaw, wx, wz, elevation, pump = state.at
     vx, vy, vz, yaw_rate, vwx, vwz, elevation_rate, _ = state.rate
     ax, ay, az, yaw_acceleration, _, _, _, _ = state.acceleration
@@ -230,7 +236,7 @@ def _reference(state: State, params: AllParams, compliant: float, pressing: bool
     return Reference(
         (x, y, z), (vx, vy, vz), (ax, ay, az), yaw, yaw_rate, yaw_acceleration, (wx, wz), (vwx, vwz), elevation,
         elevation_rate, pump, own.gripper_open if open_gripper else own.gripper_closed, state.lift, state.force,
-        pressing,
+        force_ahead, pressing,
         leg is not None and leg.pumping, state.phase is Phase.ADHESIVE, compliant, offset.velocity, offset.displacement,
     )  # fmt: skip
 

@@ -130,6 +130,8 @@ class Reference(Struct, frozen=True, gc=False):
     """Share of the actuation in force: 0 standing, 1 flying, in between while the motors spool up or down."""
     force: float
     """Desired compressive force, N."""
+    force_ahead: float
+    """The same a moment later: what is fed forward, since the attitude lags."""
     pressing: bool
     """The force loop is closed."""
     dispensing: bool
