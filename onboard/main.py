@@ -36,7 +36,7 @@ class Progress:
         if shown:
             from tqdm import tqdm
 
-            form = "{desc:<12} |{bar:30}| {postfix}, {elapsed} elapsed"
+            form = "{desc:<12} |{bar:30}| {elapsed} elapsed{postfix}"
             self._bar = tqdm(total=len(CHAIN) - 1, bar_format=form, leave=False)
         self._count = 0
 
