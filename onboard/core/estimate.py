@@ -97,7 +97,7 @@ def step(
             finite = False
     bus = inputs.servos
     if bus is not None:
-        if _finite(bus.position, bus.velocity, bus.current):
+        if _finite(bus.position, bus.velocity, bus.current, bus.voltage, bus.temperature):
             servos = bus
         else:
             finite = False
