@@ -98,6 +98,7 @@ FIELDS = [
     ("odometry", "p_WB", 3), ("odometry", "v_WB", 3), ("odometry", "q_WB", 4),
     ("autopilot", "q_WB", 4), ("autopilot", "w_WB_B", 3), ("autopilot", "f_B", 3),
     ("servos", "position", 5), ("servos", "velocity", 5), ("servos", "current", 5),
+    ("servos", "voltage", 5), ("servos", "temperature", 5),
 ]  # fmt: skip
 
 
