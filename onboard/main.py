@@ -97,9 +97,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _prepare(config: Config, out: Path) -> Path:
     """The path of the log in a fresh run folder. Checks the mission before anything is written."""
-    from onboard.core.derived import derive
+    from onboard.core.derived import check_mission
 
-    derive(config)
+    check_mission(config)
     out.mkdir(parents=True, exist_ok=True)
     (out / "config.yaml").write_text(dump_config(config))
     return out / "log.mcap"

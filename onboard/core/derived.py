@@ -18,12 +18,17 @@ class Derived:
         self.params = params
         self.model = Model.from_vehicle(params.vehicle)
         self.site = plan.survey(params.pipe, params.vehicle, params.plan)
-        plan.check_fence(self.site, params.pipe, params.plan, params.safety.fence_low, params.safety.fence_high)
         self.bounds = limits.bounds(params.vehicle, params.limits)
         gains = params.backstepping
         per_mass = gains.contact_stiffness if gains.compliant else gains.alpha * gains.gamma + 1.0
         self.normal_stiffness = per_mass * self.model.mass(True)
         """Stiffness of the translation law along the contact normal while pressing, N/m."""
+
+
+def check_mission(params: Params) -> None:
+    """Raise ``plan.InfeasibleError`` when the mission cannot be flown; to be asked before a flight, not in it."""
+    site = derive(params).site
+    plan.check_fence(site, params.pipe, params.plan, params.safety.fence_low, params.safety.fence_high)
 
 
 _last: Derived | None = None

@@ -45,18 +45,19 @@ class State(Struct, frozen=True, gc=False):
 
 
 def attitude_and_thrust(force: Vec3, yaw: float, params: Params) -> tuple[float, float, float]:
-    """Roll, pitch (rad) and thrust (N) that yield ``force`` (N, W) at heading ``yaw`` (rad)."""
+    """Roll, pitch (rad) and thrust (N) that yield ``force`` (N, W) at heading ``yaw`` (rad), within the tilt limit."""
     c, s = cos(yaw), sin(yaw)
     ahead = c * force[0] + s * force[1]
     right = s * force[0] - c * force[1]
     lift = max(force[2], params.thrust_min)
     if params.exact:
-        thrust = sqrt(ahead * ahead + right * right + lift * lift)
-        roll, pitch = asin(right / thrust), atan2(ahead, lift)
+        roll, pitch = asin(right / sqrt(ahead * ahead + right * right + lift * lift)), atan2(ahead, lift)
     else:
-        thrust, roll, pitch = lift, right / lift, ahead / lift
+        roll, pitch = right / lift, ahead / lift
     m = params.tilt_max
-    return min(m, max(-m, roll)), min(m, max(-m, pitch)), thrust
+    roll, pitch = min(m, max(-m, roll)), min(m, max(-m, pitch))
+    # the lift is kept even where the tilt is limited: the horizontal force that cannot be had is not made up by thrust
+    return roll, pitch, lift / (cos(roll) * cos(pitch)) if params.exact else lift
 
 
 def step(state: State, roll: float, pitch: float, params: Params, dt: float) -> tuple[State, float, float]:
