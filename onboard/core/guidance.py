@@ -454,5 +454,9 @@ def _near(state: State, estimate: Estimate, params: Params) -> bool:
 
 
 def _touched_down(state: State, estimate: Estimate) -> bool:
-    """The reference has gone well below the vehicle, which no longer sinks: it stands; or it is being spooled down."""
-    return state.lift < 1.0 or (estimate.p_WB[2] - state.at[2] > SUNK and abs(estimate.v_WB[2]) < SINKING)
+    """The reference has gone into the ground and well below the vehicle, which no longer sinks: it stands.
+
+    Or it is being spooled down already. Above the ground a gust can lift it as far, and hold it there for a moment.
+    """
+    sunk = state.at[2] < state.home[2] and estimate.p_WB[2] - state.at[2] > SUNK
+    return state.lift < 1.0 or (sunk and abs(estimate.v_WB[2]) < SINKING)
