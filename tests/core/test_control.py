@@ -166,7 +166,7 @@ def test_the_attitude_set_point_is_the_attitude_wanted() -> None:
 
 
 def pressing(force: float) -> Reference:
-    return replace(REFERENCE, pressing=True, force=force)
+    return replace(REFERENCE, pressing=True, force=force, force_ahead=force)
 
 
 def test_the_desired_force_leans_the_vehicle_into_the_pipe() -> None:
@@ -276,7 +276,8 @@ beliefs = st.builds(
 )  # fmt: skip
 references = st.builds(
     lambda p, v, a, yaw, wrist, elevation, lift, force, pressing: replace(
-        REFERENCE, p=p, v=v, a=a, yaw=yaw, wrist=wrist, elevation=elevation, lift=lift, force=force, pressing=pressing
+        REFERENCE, p=p, v=v, a=a, yaw=yaw, wrist=wrist, elevation=elevation, lift=lift, force=force,
+        force_ahead=1.2 * force, pressing=pressing,
     ),
     vector(50.0), vector(5.0), vector(5.0), st.floats(-10.0, 10.0),
     st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)), st.floats(-3.0, 3.0),

@@ -340,6 +340,16 @@ def test_on_the_ground_the_motors_spool_down(mission: list[Step]) -> None:
     assert [s.progress.grounded for s in mission].index(True) == len(mission) - 1
 
 
+def test_lifted_by_a_gust_in_the_landing_the_motors_stay_on(moments: list[Follower]) -> None:
+    landing = next(m for m in moments if m.steps[-1].phase is Phase.LAND and m.steps[-1].reference.lift == 1.0)
+    for height in (0.1, 0.3, 1.0):
+        follower = landing.copy()
+        x, y, z = follower.estimate.p_WB
+        assert z > CONFIG.vehicle.base.gear_height + 0.3
+        follower.estimate = replace(follower.estimate, p_WB=(x, y, z + height), v_WB=(0.0, 0.0, 0.0))
+        assert follower.tick(Phase.LAND).reference.lift == 1.0
+
+
 def test_it_lands_where_it_took_off(mission: list[Step]) -> None:
     first, last = of(mission, Phase.TAKEOFF)[0], of(mission, Phase.LAND)[-1]
     assert last.p[:2] == pytest.approx(first.p[:2])

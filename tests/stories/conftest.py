@@ -15,6 +15,7 @@ MOMENTS = (
     ("spool", Phase.TAKEOFF, 0.3),
     ("takeoff", Phase.TAKEOFF, 4.0),
     ("approach", Phase.APPROACH, 2.0),
+    ("align", Phase.ALIGN, 0.5),
     ("adhesive", Phase.ADHESIVE, 8.0),
     ("advance", Phase.ADVANCE, 2.0),
     ("press", Phase.PRESS, 8.5),
