@@ -48,6 +48,9 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     tare_settle: Annotated[float, spec("s", 0.0, 20.0, "rest before the tare")] = 2.0
     tare_time: Annotated[float, spec("s", 0.5, 30.0, "time the tare is averaged over")] = 3.0
     force_down: Annotated[float, spec("s", 0.2, 10.0, "time in which the force is taken back before a retreat")] = 1.0
+    pull_back: Annotated[float, spec("N", 0.0, 2.0, "pull with which the tip comes free, after the force is back")] = (
+        0.3
+    )
     release_hold: Annotated[float, spec("s", 0.0, 10.0, "time at the bias after the gripper has opened")] = 1.0
     gripper_closed: Annotated[float, spec("rad", -3.14, 3.14, "gripper servo angle that holds the sleeve")] = 0.0
     gripper_open: Annotated[float, spec("rad", -3.14, 3.14, "gripper servo angle that lets it go")] = 1.0
@@ -173,7 +176,9 @@ def step(
             force, ahead = _taken_back(easing, state, own), _taken_back(easing + lead, state, own)
         else:
             state = replace(_start_from(state, _base_measured(state.at, estimate)), press_start=0.0)
-            state = replace(state, legs=_plan(phase, state, site, params))
+            # the vehicle is on its way already: the retreat goes on from that speed
+            vx, vy, _ = estimate.v_WB
+            state = replace(state, start_rate=(vx, vy, *ZERO[2:]), moving=True, legs=_plan(phase, state, site, params))
             easing = -1.0
 
     ended = state.index >= len(state.legs)
@@ -217,7 +222,7 @@ def _profile(t: float, state: State, params: AllParams) -> tuple[float, bool]:
 
 
 def _taken_back(t: float, state: State, params: Params) -> float:
-    return state.press_start * (1.0 - force_profile.quintic(t / params.force_down))
+    return state.press_start - (state.press_start + params.pull_back) * force_profile.quintic(t / params.force_down)
 
 
 def _reference(state: State, params: AllParams, compliant: float, force_ahead: float, pressing: bool) -> Reference:

@@ -258,12 +258,13 @@ def test_the_force_is_taken_back_before_the_retreat(by: Phase, after: float) -> 
     before = follower.steps[-1].reference
     assert before.force > 0.1
     follower.run(by, G.force_down)
-    down = [s.reference for s in follower.steps[-round(G.force_down / DT) :]]
+    *down, freed = [s.reference for s in follower.steps[-round(G.force_down / DT) :]]
     forces = [before.force, *(r.force for r in down)]
     assert all(b <= a for a, b in pairwise(forces))
-    assert max(a - b for a, b in pairwise(forces)) <= 1.875 * before.force / G.force_down * DT * 1.001
-    assert forces[-1] == pytest.approx(0.0, abs=1e-6)
-    assert all(r.pressing for r in down[:-1])
+    assert max(a - b for a, b in pairwise(forces)) <= 1.875 * (before.force + G.pull_back) / G.force_down * DT * 1.001
+    assert forces[-1] == pytest.approx(-G.pull_back, abs=1e-4)
+    assert all(r.pressing for r in down)
+    assert (freed.force, freed.pressing) == (0.0, False)
     start = follower.estimate.p_WB
     follower.finish(by)
     end = follower.steps[-1].reference
