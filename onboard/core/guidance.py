@@ -35,6 +35,8 @@ SMOOTH_START = 1.0
 #: From this height above the standing height on, the vehicle descends at constant speed, m; the reference goes on
 #: below the ground by as much again, so that the skids are found wherever they are.
 LAST_DESCENT = 0.35
+#: An estimate this long (s) after the retreat has begun tells whether there is contact.
+SHORTEST_EASE = 0.05
 #: Touched down: the reference is this far below the vehicle (m), which sinks no faster than this (m/s).
 SUNK, SINKING = 0.06, 0.05
 
@@ -171,14 +173,17 @@ def step(
         force = ahead = params.force_profile.bias
     elif easing >= 0.0:
         easing += dt
-        if easing < own.force_down:
+        # without contact there is no force to take back: what is left of it would push the vehicle into the pipe
+        if easing < own.force_down and (easing < SHORTEST_EASE or estimate.contact_force > params.contact.lost_force):
             pressing, paused = True, True
             force, ahead = _taken_back(easing, state, own), _taken_back(easing + lead, state, own)
         else:
             state = replace(_start_from(state, _base_measured(state.at, estimate)), press_start=0.0)
-            # the vehicle is on its way already: the retreat goes on from that speed
-            vx, vy, _ = estimate.v_WB
-            state = replace(state, start_rate=(vx, vy, *ZERO[2:]), moving=True, legs=_plan(phase, state, site, params))
+            # the vehicle is on its way already: the retreat goes on from the speed with which it leaves the pipe
+            (nx, ny), (vx, vy, _) = site.normal, estimate.v_WB
+            away = min(0.0, max(-params.plan.near_speed, vx * nx + vy * ny))
+            leaving = (away * nx, away * ny, *ZERO[2:])
+            state = replace(state, start_rate=leaving, moving=True, legs=_plan(phase, state, site, params))
             easing = -1.0
 
     ended = state.index >= len(state.legs)
