@@ -274,6 +274,28 @@ def test_the_force_is_taken_back_before_the_retreat(by: Phase, after: float) -> 
     assert not end.pressing
 
 
+@pytest.mark.parametrize("speed", [0.3, 0.02, -0.02, -2.0])
+def test_a_retreat_goes_on_from_the_speed_away_from_the_pipe_and_no_other(speed: float) -> None:
+    follower = at_contact(0.3)
+    follower.run(Phase.PRESS, 3.0)
+    follower.run(Phase.RETREAT_HOLD, G.force_down - 0.02)
+    place = follower.from_crack
+    n = follower.site.normal
+    for _ in range(10):
+        follower.estimate = replace(follower.estimate, v_WB=(speed * n[0], speed * n[1], 0.3))
+        reference = follower.tick(Phase.RETREAT_HOLD).reference
+    assert not reference.pressing
+    away = -(reference.v[0] * n[0] + reference.v[1] * n[1])
+    assert away == pytest.approx(min(P.near_speed, max(0.0, -speed)), abs=0.02 * P.near_speed)
+    assert abs(reference.v[2]) < 1e-12
+    follower.finish(Phase.RETREAT_HOLD)
+    nearest = min(
+        -sum((p - q) * k for p, q, k in zip(s.reference.p[:2], follower.site.crack[:2], n, strict=True))
+        for s in follower.steps[-1000:]
+    )
+    assert nearest >= place - 1e-3
+
+
 @pytest.mark.parametrize("then", BACKING_OUT)
 def test_one_retreat_that_turns_into_another_goes_on(then: Phase) -> None:
     straight, turned = at_contact(0.3), at_contact(0.3)
