@@ -40,10 +40,11 @@ class Log:
     def at(self, name: str) -> Flight:
         """A flight of its own that begins at the moment of that name."""
         while name not in self._kept:
-            next_name, phase, time = self._left.pop(0)
+            next_name, phase, time = self._left[0]
             flight = self._flight
             flight.until(lambda o, phase=phase, time=time: o.phase is phase and o.phase_time >= time, 60.0)  # type: ignore[misc]
             self._kept[next_name] = flight.copy()
+            del self._left[0]
         return self._kept[name].copy()
 
 
