@@ -153,7 +153,8 @@ def step(
     if phase in NEAR_PIPE:
         crack = site.crack
         distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
-        trigger = contact_trigger.step(trigger, distance, compression, params.contact, dt)
+        asked = reference.force if reference is not None and reference.pressing else 0.0
+        trigger = contact_trigger.step(trigger, distance, compression, asked, params.contact, dt)
     elif trigger.contact or trigger.time:
         trigger = contact_trigger.State()
 

@@ -174,7 +174,12 @@ def step(
     elif easing >= 0.0:
         easing += dt
         # without contact there is no force to take back: what is left of it would push the vehicle into the pipe
-        if easing < own.force_down and (easing < SHORTEST_EASE or estimate.contact_force > params.contact.lost_force):
+        into_nothing = (
+            easing > SHORTEST_EASE
+            and state.force > params.force_profile.bias
+            and estimate.contact_force < params.contact.lost_force
+        )
+        if easing < own.force_down and not into_nothing:
             pressing, paused = True, True
             force, ahead = _taken_back(easing, state, own), _taken_back(easing + lead, state, own)
         else:

@@ -125,9 +125,11 @@ T = contact_trigger.Params()
 NO_CONTACT = contact_trigger.State()
 
 
-def run(pairs: list[tuple[float, float]], state: contact_trigger.State = NO_CONTACT) -> contact_trigger.State:
+def run(
+    pairs: list[tuple[float, float]], state: contact_trigger.State = NO_CONTACT, desired: float = 0.0
+) -> contact_trigger.State:
     for distance, force in pairs:
-        state = contact_trigger.step(state, distance, force, T, DT)
+        state = contact_trigger.step(state, distance, force, desired, T, DT)
     return state
 
 
@@ -146,6 +148,14 @@ def test_trigger_lets_go_only_after_its_time() -> None:
     assert run([(0.0, 0.0)] * (n - 2), held).contact
     assert not run([(0.0, 0.0)] * n, held).contact
     assert run(([(0.0, 0.0)] * (n - 2) + [(0.0, 0.2)]) * 5, held).contact
+
+
+def test_a_push_into_nothing_is_told_at_once() -> None:
+    held = contact_trigger.State(True)
+    n = round(T.short_time / DT) + 1
+    assert not run([(0.0, 0.3 * 2.5)] * n, held, 2.5).contact
+    assert run([(0.0, 0.5 * 2.5)] * 10 * n, held, 2.5).contact, "half the force is contact still"
+    assert run([(0.0, 0.1)] * n, held, 0.3).contact, "at the bias, little force is nothing special"
 
 
 # --- force profile ----------------------------------------------------------------------------------------------------
