@@ -1,0 +1,103 @@
+"""The mission in real time: the PX4 driver over MAVLink to the stand-in, vision and servos mock.
+
+Bounds are wide on purpose: they tell a loop that keeps up from one that does not, on a busy machine too.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pytest
+
+from onboard.replay import replay
+from tests.acceptance.flights import Flown, completed, look, pipewright
+
+#: About 65 s of flight: a near pipe, brisk motion, a light and short press.
+BRISK = (
+    "pipe.position=[1.6,0,1.2]",
+    "plan.takeoff_height=0.8",
+    "plan.standoff=0.8",
+    "plan.gap=0.03",
+    "plan.speed=0.8",
+    "plan.acceleration=0.8",
+    "plan.jerk=2",
+    "plan.near_speed=0.25",
+    "plan.advance_speed=0.015",
+    "plan.arm_speed=0.25",
+    "plan.needle_speed=0.1",
+    "plan.arc_max=0.6",
+    "plan.retreat=0.2",
+    "plan.descent_speed=0.3",
+    "guidance.tare_settle=1",
+    "guidance.tare_time=1",
+    "force_profile.settle=0.5",
+    "force_profile.bias_hold=0.5",
+    "force_profile.ramp=3",
+    "repair.force=1.5",
+    "repair.hold=2",
+)
+
+
+@pytest.fixture(scope="module")
+def folder() -> Iterator[Path]:
+    """The run folder of ``pipewright desk``."""
+    with TemporaryDirectory(prefix="pipewright-") as name:
+        done = pipewright("desk", "--out", "run", *(f"--set={item}" for item in BRISK), cwd=Path(name), timeout=300.0)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "Traceback" not in done.stderr
+        yield Path(name) / "run"
+
+
+@pytest.fixture(scope="module")
+def flown(folder: Path) -> Flown:
+    return look(folder / "log.mcap")
+
+
+@pytest.fixture(scope="module")
+def told(folder: Path) -> dict[str, Any]:
+    figures: dict[str, Any] = json.loads((folder / "metrics.json").read_text())
+    return figures
+
+
+def test_the_mission_completes_in_real_time(flown: Flown, told: dict[str, Any]) -> None:
+    assert completed(flown)
+    assert flown.run.info.realtime
+    assert flown.run.info.scenario == "desk"
+    assert 40.0 < told["sim_s"] <= told["wall_s"] < 1.5 * told["sim_s"] + 30.0
+
+
+def test_it_presses(told: dict[str, Any]) -> None:
+    assert told["contact"]["source"] == "truth"
+    assert told["contact"]["hold_mean"] == pytest.approx(1.5, abs=0.15)
+
+
+def test_achieved_rates_are_told(told: dict[str, Any]) -> None:
+    rates = told["timing"]["rates"]
+    assert set(rates) == {"tick", "odometry", "autopilot", "servos"}
+    assert 150.0 < rates["tick"] < 255.0
+    assert min(rates.values()) > 75.0
+
+
+def test_the_age_of_every_sample_is_told(flown: Flown, told: dict[str, Any]) -> None:
+    for device, ages in told["timing"]["ages"].items():
+        assert 0.0 <= ages["median"] <= ages["p99"] <= ages["max"], device
+        assert ages["median"] < 0.03, device
+        assert flown.run.ages[device].shape == flown.run.t.shape
+
+
+def test_the_lateness_of_the_loop_is_told(flown: Flown, told: dict[str, Any]) -> None:
+    for name, values in (("late", flown.run.late), ("busy", flown.run.busy)):
+        spread = told["timing"][name]
+        assert len(values) == len(flown.run.t)
+        assert 0.0 < spread["median"] < 0.004, name
+        assert spread["median"] <= spread["p99"] <= spread["max"]
+
+
+def test_the_same_core_replays_it_without_difference(flown: Flown) -> None:
+    found = replay(flown.log)
+    assert found.same, str(found)
+    assert found.ticks == len(flown.run.t)

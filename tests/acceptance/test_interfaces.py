@@ -1,0 +1,45 @@
+"""What a vehicle accepts: attitude or body rate with thrust, joints by position; autopilot loops as PX4's."""
+
+from __future__ import annotations
+
+import pytest
+
+from groundstation.metrics import PAPER
+from tests.acceptance.flights import SHORT, Hangar, completed, contact_kept, in_limits
+
+
+def rate_loop(bandwidth: float) -> tuple[str, ...]:
+    """The autopilot's attitude loop as PX4's, its rate loop of this bandwidth (rad/s), 12 ms of command delay."""
+    return (
+        "world.loops.attitude_gain=6.5",
+        f"world.loops.bandwidth={bandwidth}",
+        "world.autopilot.command_delay=0.012",
+    )
+
+
+@pytest.mark.parametrize(
+    ("interface", "bandwidth"),
+    [("attitude", 25.0), ("attitude", 40.0), ("body_rate", 25.0), ("body_rate", 30.0), ("body_rate", 40.0)],
+)
+def test_tuned_law(fly: Hangar, interface: str, bandwidth: float) -> None:
+    flown = fly(*SHORT, f"interface={interface}", *rate_loop(bandwidth))
+    assert completed(flown)
+    assert contact_kept(flown)
+    assert flown.metrics["force_rmse"]["meas_des"] <= 0.15
+    assert in_limits(flown)
+
+
+@pytest.mark.parametrize("interface", ["wrench", "attitude"])
+def test_joints_by_position(fly: Hangar, interface: str) -> None:
+    flown = fly(*SHORT, f"interface={interface}", "joints=position")
+    assert completed(flown)
+    assert flown.metrics["force_rmse"]["meas_des"] <= 0.15
+    assert in_limits(flown)
+
+
+@pytest.mark.parametrize("interface", ["attitude", "body_rate"])
+def test_printed_law(fly: Hangar, interface: str) -> None:
+    flown = fly(*SHORT, f"interface={interface}", *rate_loop(30.0), law="paper")
+    assert completed(flown)
+    assert flown.metrics["force_rmse"]["est_meas"] <= PAPER["force_rmse"]["est_meas"]
+    assert in_limits(flown)
