@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 from msgspec.structs import replace
 
 from drivers.samples import AutopilotState
@@ -86,7 +85,6 @@ def test_nothing_flies_into_the_gap_when_the_pipe_is_gone(at: At) -> None:
     assert max(farthest, flight.truth.p_WB[0]) < start + 0.25
 
 
-@pytest.mark.xfail(reason="contact.lost_time: the push goes on for half a second after the tip has slipped off")
 def test_blown_off_the_pipe_it_does_not_run_into_it(at: At) -> None:
     """A gust lifts the tip over the pipe: nothing holds the push any more."""
     flight = at("press")
