@@ -140,7 +140,7 @@ def step(
     )  # fmt: skip
     if own.contact_torque and reference.pressing:
         n = derived.site.normal
-        f = contact * reference.force
+        f = contact * max(0.0, reference.force)  # the pipe does not pull
         push = model.contact_torque(q, (-f * n[0], -f * n[1], 0.0))
         t3, t4, t5, t6, t7, t8 = t3 - push[3], t4 - push[4], t5 - push[5], t6 - push[6], t7 - push[7], t8 - push[8]
     torque = math3.body_torque_from_euler(rpy, (t3, t4, t5))
