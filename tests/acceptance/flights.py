@@ -19,8 +19,16 @@ COMMAND = Path(sys.executable).with_name("pipewright")
 
 #: What is asked of the tuned law in the scenario of the paper, N.
 FORCE_ROWS = {"est_des": 0.05, "meas_des": 0.05, "est_meas": 0.025}
-#: A shorter mission, for tests that look at the press: a short and quick arc of the needle, a short hold.
-SHORT = ("plan.needle_speed=0.1", "plan.arc_max=0.6", "repair.hold=2")
+#: A shorter mission, for tests that look at the press: quick motion of arm and needle, a short arc, a short hold.
+SHORT = (
+    "plan.near_speed=0.3",
+    "plan.yaw_rate=1",
+    "plan.arm_speed=0.25",
+    "plan.needle_speed=0.1",
+    "plan.arc_max=0.6",
+    "plan.descent_speed=0.3",
+    "repair.hold=2",
+)
 
 
 class Flown(NamedTuple):

@@ -39,7 +39,7 @@ def test_joints_by_position(fly: Hangar, interface: str) -> None:
 
 @pytest.mark.parametrize("interface", ["attitude", "body_rate"])
 def test_printed_law(fly: Hangar, interface: str) -> None:
-    flown = fly(*SHORT, f"interface={interface}", *rate_loop(30.0), law="paper")
+    flown = fly(*SHORT, "force_profile.ramp=10", f"interface={interface}", *rate_loop(30.0), law="paper")
     assert completed(flown)
     assert flown.metrics["force_rmse"]["est_meas"] <= PAPER["force_rmse"]["est_meas"]
     assert in_limits(flown)
