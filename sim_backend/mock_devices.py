@@ -32,7 +32,13 @@ class _Mock:
 
 
 class MockAutopilot(_Mock):
-    """The autopilot of the world; works towards the commanded ``Engage`` as the real driver does."""
+    """The autopilot of the world; works towards the commanded ``Engage`` as the real driver does.
+
+    Offboard that was reached and then left (by a pilot, or a failsafe) is not taken back until something else has been
+    wanted in between.
+    """
+
+    _reached = False
 
     def latest(self) -> AutopilotState | None:
         """Newest attitude, inertial data and status."""
@@ -44,6 +50,8 @@ class MockAutopilot(_Mock):
     def command(self, command: AutopilotCommand) -> None:
         """Hand over one fresh set-point."""
         autopilot, t = self._world.autopilot, self._world.time
+        if command.engage is not Engage.OFFBOARD:
+            self._reached = False
         if command.engage is Engage.KILL:
             autopilot.kill()
         elif command.engage is Engage.IDLE:
@@ -57,7 +65,9 @@ class MockAutopilot(_Mock):
                 t, SetPoint(command.interface, command.thrust, command.torque_B, command.q_WB, command.w_WB_B)
             )
             engaged = autopilot.armed and autopilot.mode is FlightMode.OFFBOARD
-            if not engaged and autopilot.streaming(t) and autopilot.arm():
+            if engaged:
+                self._reached = True
+            elif not self._reached and autopilot.streaming(t) and autopilot.arm():
                 autopilot.switch(FlightMode.OFFBOARD, t)
 
 

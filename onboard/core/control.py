@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Struct
 
-from drivers.samples import Interface, JointMode, Vec3
+from drivers.samples import Interface, Vec3
 from onboard.core import backstepping, compensation, kinematics, math3, sliding_mode, tilt
 from onboard.core.derived import Derived
 from onboard.core.spec import note, spec
@@ -55,11 +55,16 @@ def step(
     reference: Reference,
     flying: bool,
     near_pipe: bool,
+    joints_closed: bool,
     derived: Derived,
     params: AllParams,
     dt: float,
 ) -> tuple[State, Control]:
-    """One tick of the laws. flying: off the ground (the laws adapt); near_pipe: the tip is at the pipe."""
+    """One tick of the laws.
+
+    flying: off the ground (the laws adapt); near_pipe: the tip is at the pipe; joints_closed: our law closes the
+    joints' loops (else the servos do, and the torques are feed-forward alone).
+    """
     if reference.lift == 0.0:  # on the ground with the motors off: nothing of the last flight is remembered
         state = State(compensation=state.compensation)
     own, model = params.control, derived.model
@@ -125,8 +130,8 @@ def step(
     # torques is feed-forward, and the joints do not answer to an attitude law that nobody applies.
     sliding, angular, adapted = sliding_mode.step(
         state.sliding,
-        _ours(error, params),
-        _ours(error_rate, params),
+        _ours(error, params, joints_closed),
+        _ours(error_rate, params, joints_closed),
         (roll_acceleration, pitch_acceleration, reference.yaw_acceleration, *joint_acceleration),
         flying,
         params.sliding_mode,
@@ -176,11 +181,11 @@ def step(
     )
 
 
-def _ours(error: sliding_mode.Six, params: AllParams) -> sliding_mode.Six:
+def _ours(error: sliding_mode.Six, params: AllParams, joints_closed: bool) -> sliding_mode.Six:
     """``error`` on the axes whose loops are closed by our law, 0 on the others."""
     if params.interface is not Interface.WRENCH:
         error = (0.0, 0.0, 0.0, *error[3:])
-    return error if params.joints is JointMode.TORQUE else (*error[:3], 0.0, 0.0, 0.0)
+    return error if joints_closed else (*error[:3], 0.0, 0.0, 0.0)
 
 
 def _arm(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from drivers.samples import Engage, FlightMode, Landed
+from drivers.samples import Engage, FlightMode, JointMode, Landed
 from onboard.core import limits, math3, mission, safety
 from onboard.core.guidance import Progress
 from onboard.core.types import Estimate, Inputs, Phase, Reference, Verdict
@@ -130,6 +130,17 @@ def for_mission(
         blind=safety.blind(verdict),
         offboard_lost=safety.yielded(verdict),
     )
+
+
+def joint_drive(seen: estimating.State, believed: Estimate, params: Params) -> tuple[JointMode, bool]:
+    """How the joints are driven in this tick, and whether our joint law closes their loop.
+
+    Joints that are not seen any more are held by the servos themselves: torques would fling the arm. And where the
+    servos do not obey, the loop stays open: the base must not answer to an arm that does not move.
+    """
+    mode = params.joints if believed.age_servos <= params.safety.servos_late else JointMode.POSITION
+    limp = seen.servos is not None and not seen.servos.torque_on
+    return mode, mode is JointMode.TORQUE and not limp
 
 
 def permission(phase: Phase, engage: Engage, believed: Estimate, aloft: bool) -> limits.Permission:

@@ -35,6 +35,8 @@ SMOOTH_START = 1.0
 #: From this height above the standing height on, the vehicle descends at constant speed, m; the reference goes on
 #: below the ground by as much again, so that the skids are found wherever they are.
 LAST_DESCENT = 0.35
+#: The advance goes on this far past the overtravel that ends it, m.
+BEYOND = 0.02
 #: An estimate this long (s) after the retreat has begun tells whether there is contact.
 SHORTEST_EASE = 0.05
 #: Touched down: the reference is this far below the vehicle (m), which sinks no faster than this (m/s).
@@ -343,7 +345,7 @@ def _plan(phase: Phase, state: State, site: Site, params: AllParams) -> tuple[Le
     elif phase is Phase.TARE:
         path.to(base=plan.beside(site, site.near), yaw=site.yaw, arm=(p.press_reach, 0.0, 0.0), slow=True)
     elif phase is Phase.ADVANCE:
-        way = p.gap + p.overtravel
+        way = p.gap + p.overtravel + BEYOND
         path.add(_uniform(at, (way * n[0], way * n[1], 0.0), p.advance_speed))
     elif phase in BACKING_OUT:
         path.to(base=(at[0] - p.retreat * n[0], at[1] - p.retreat * n[1], at[2]), slow=True)

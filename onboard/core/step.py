@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from msgspec import Struct
-from msgspec.structs import replace
 
-from drivers.samples import Engage, JointMode
+from drivers.samples import Engage
 from onboard.core import actuation, control, estimate, facts, guidance, limits, mission, safety
 from onboard.core.derived import derive
 from onboard.core.params import Params
@@ -60,12 +59,8 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
     )
     aloft = flying and reference.lift >= 1.0
     at_pipe = task.phase in estimate.NEAR_PIPE
-    # Joints that are not seen any more are held by the servos themselves: torques would fling the arm. And where the
-    # servos do not obey, the joint law stays open: the base must not answer to an arm that does not move.
-    joints = params.joints if believed.age_servos <= params.safety.servos_late else JointMode.POSITION
-    limp = seen.servos is not None and not seen.servos.torque_on
-    applied = params if joints is params.joints and not limp else replace(params, joints=JointMode.POSITION)
-    laws, wanted = control.step(state.control, believed, reference, aloft, at_pipe, derived, applied, dt)
+    joints, closed = facts.joint_drive(seen, believed, params)
+    laws, wanted = control.step(state.control, believed, reference, aloft, at_pipe, closed, derived, params, dt)
     engage = mission.engage(task, known)
     obeyed = known.engaged and engage is Engage.OFFBOARD
     autopilot = actuation.autopilot_command(wanted, engage, params.interface)

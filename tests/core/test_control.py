@@ -53,7 +53,9 @@ def act(
     state = State() if state is None else state
     wanted = None
     for _ in range(ticks):
-        state, wanted = control.step(state, estimate, reference, flying, near_pipe, derive(config), config, DT)
+        state, wanted = control.step(
+            state, estimate, reference, flying, near_pipe, config.joints is JointMode.TORQUE, derive(config), config, DT
+        )
     assert wanted is not None
     return state, wanted
 
