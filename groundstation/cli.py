@@ -23,6 +23,8 @@ exit codes:
   2  wrong input; nothing was written
   3  ended safely, but not completed
   4  vehicle lost
+  5  a device cannot be had
+  130  interrupted; what was recorded until then is reported
 """
 _SIM_EPILOG = """\
 examples:

@@ -7,6 +7,9 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+#: The virtual clock gives way to other tasks once in so many sleeps.
+GIVE_WAY = 50
+
 
 class Clock(Protocol):
     """What the loop knows of time."""
@@ -39,13 +42,17 @@ class VirtualClock:
     def __init__(self, advance: Callable[[float], None]) -> None:
         self._now_ns = 0
         self._advance = advance
+        self._sleeps = 0
 
     def now_ns(self) -> int:
         """Simulated nanoseconds since the start."""
         return self._now_ns
 
     async def sleep_until(self, t_ns: int) -> None:
-        """Move the world to ``t_ns``."""
+        """Move the world to ``t_ns``. Gives way now and then, so that an interrupt is heard."""
+        self._sleeps += 1
+        if self._sleeps % GIVE_WAY == 0:
+            await asyncio.sleep(0)
         if t_ns > self._now_ns:
             self._advance((t_ns - self._now_ns) * 1e-9)
             self._now_ns = t_ns

@@ -1,7 +1,8 @@
 """The whole configuration of a run, composed from the files in ``configs/`` and the command line.
 
-Later layers win: ``vehicle.yaml`` (as ``vehicle``), ``controllers/<law>.yaml``, ``interfaces/<interface>.yaml`` (gains
-are chosen for what the autopilot is sent), the scenario, ``--set``, ``--seed``.
+Later layers win: ``vehicle.yaml`` (as ``vehicle``), ``controllers/<law>.yaml``, ``joints/<joints>.yaml`` and
+``interfaces/<interface>.yaml`` (gains are chosen for what servos and autopilot are sent), the scenario, ``--set``,
+``--seed``.
 """
 
 from __future__ import annotations
@@ -74,7 +75,8 @@ def load_config(
         layers = [
             attempt(_vehicle, directory),
             controller,
-            attempt(_interface, [controller, scene, *options], directory),
+            attempt(_gains, "joints", [controller, scene, *options], directory / "joints"),
+            attempt(_gains, "interface", [controller, scene, *options], directory / "interfaces"),
             scene,
             Layer("--scenario", {"scenario": scenario}),
             Layer("--law", {"law": given}),
@@ -119,10 +121,10 @@ def _controller(law: Any, origin: str, directory: Path) -> Layer:
     return _named("law", law, origin, directory / "controllers")
 
 
-def _interface(layers: Sequence[Layer | None], directory: Path) -> Layer | None:
-    """What differs for the interface that the last of ``layers`` to name one asks for; None when nothing does."""
-    asked = [layer.values["interface"] for layer in layers if layer and "interface" in layer.values]
-    path = directory / "interfaces" / f"{asked[-1]}.yaml" if asked else None
+def _gains(key: str, layers: Sequence[Layer | None], folder: Path) -> Layer | None:
+    """What differs for the value of ``key`` that the last of ``layers`` to name one asks for; None if nothing."""
+    asked = [layer.values[key] for layer in layers if layer and key in layer.values]
+    path = folder / f"{asked[-1]}.yaml" if asked else None
     return read_yaml(path, _shown(path)) if path and path.is_file() else None
 
 

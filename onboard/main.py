@@ -100,8 +100,11 @@ def _prepare(config: Config, out: Path) -> Path:
     from onboard.core.derived import check_mission
 
     check_mission(config)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "config.yaml").write_text(dump_config(config))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "config.yaml").write_text(dump_config(config))
+    except OSError as error:
+        raise ConfigError([f"--out {out}: cannot be written: {error.strerror}; give a folder that can"]) from error
     return out / "log.mcap"
 
 

@@ -112,7 +112,7 @@ def test_the_seed_option_wins_over_all(configs: Path) -> None:
         ("vehicle.base.mass=2", "vehicle.base.mass", 2.0),
         ("vehicle.arm.parts.2.mass=0.02", "vehicle.arm.parts.2.mass", 0.02),
         ("pipe.position.2=2.5", "pipe.position.2", 2.5),
-        ("joints=position", "joints", "position"),
+        ("joint_current=0.5", "joint_current", 0.5),
     ],
 )
 def test_options_reach_scenario_laws_and_vehicle(option: str, path: str, value: object) -> None:
@@ -125,6 +125,7 @@ def test_the_interface_brings_its_gains_and_options_still_win() -> None:
     assert rate.interface == "body_rate"
     assert rate.control.rate_lead > 0.0 == load_config().control.rate_lead
     assert rate.tilt.bandwidth == 7.0
+    assert load_config(sets=["joints=position"]).tilt.bandwidth < load_config().tilt.bandwidth
 
 
 def test_an_option_reaches_every_parameter() -> None:
