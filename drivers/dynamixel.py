@@ -14,6 +14,7 @@ import asyncio
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from math import isfinite
 from threading import Event, Thread
 from time import monotonic_ns
@@ -22,7 +23,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from drivers import xc330
-from drivers.dynamixel_bus import Bus, BusError, NoAnswer, Port, latency_hint
+from drivers.dynamixel_bus import Bus, BusError, Corrupt, NoAnswer, Port, Refused, latency_hint
 from drivers.mailbox import Level, Mailbox, MailboxCounts, Notice, Notices
 from drivers.protocols import DeviceError
 from drivers.samples import SERVO_NAMES, Five, JointMode, ServoCommand, ServoState
@@ -47,7 +48,9 @@ class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True):
     torque_constant: Annotated[
         float, _meta("N m/A", "torque at the output per supply current; stall 0.93 N m at 1.80 A", 0.05, 5.0)
     ] = 0.93 / 1.80
-    current_limit: Annotated[float, _meta("A", "no goal exceeds it; below what trips the overload shutdown", 0, 2.352)] = 1.6
+    current_limit: Annotated[
+        float, _meta("A", "no goal exceeds it; below what trips the overload shutdown", 0, 2.352)
+    ] = 1.6
     profile_velocity: Annotated[float, _meta("rad/s", "in position mode; 0: no profile", 0.0, 49.0)] = 0.0
     profile_acceleration: Annotated[float, _meta("rad/s^2", "in position mode; 0: no profile", 0.0, 12_000.0)] = 0.0
     gains: tuple[Gain, Gain, Gain] | None = None
@@ -205,7 +208,7 @@ class Dynamixel:
         self._thread: Thread | None = None
         self._stopping = False
         self._wake = Event()
-        self._command: ServoCommand | None = None
+        self._command: tuple[ServoCommand, int] | None = None
         self._commanded_ns = 0
         self._goals_ns = 0
         self._left_silent = False
@@ -254,11 +257,16 @@ class Dynamixel:
         return self._box.latest()
 
     def command(self, command: ServoCommand) -> None:
-        """Hand over the goals for one cycle; it begins at once. What is not finite is not sent, and told."""
+        """Hand over the goals for one cycle; it begins at once. What is not finite is not sent, and told.
+
+        Raises DeviceError before ``start`` and after ``stop``.
+        """
+        if self._thread is None:
+            raise DeviceError("servo bus: command() before start() or after stop()")
         if not isfinite(sum(command.torque) + sum(command.position) + command.current_limit):
             self._tell_once("finite", Level.ERROR, "a command that is not finite was not sent")
             return
-        self._command = command
+        self._command = (command, self._clock())
         self._wake.set()
 
     def notices(self) -> tuple[Notice, ...]:
@@ -289,7 +297,7 @@ class Dynamixel:
             try:
                 self._set_up(bus, servo)
             except BusError as error:
-                raise DeviceError(f"servo bus: {servo.name}: {error} while it was being set up") from error
+                raise DeviceError(f"servo bus: {servo.name}, while it was being set up: {error}") from error
         self._fast = self._probe(bus)
         bus.patient(1, settings.reply_margin)
 
@@ -399,7 +407,7 @@ class Dynamixel:
         bus.write(name, item, value)
         after = bus.read(name, item)
         if after != value:
-            raise DeviceError(f"servo bus: {servo.name} did not take {item.name} {value}: it reads {after}")
+            raise Refused(name, f"it did not take {item.name} {value}, and shows {after}")
         self._tell(Level.INFO, f"{servo.name}: {item.name} set from {before} to {value}")
 
     def _prepare(self, bus: Bus, servo: _Servo, near: float) -> None:
@@ -410,12 +418,13 @@ class Dynamixel:
         bus.write(name, xc330.BUS_WATCHDOG, 0)
         bus.write_bytes(name, xc330.INDIRECT_ADDRESS, _MAP)
         if bus.read_bytes(name, xc330.INDIRECT_ADDRESS, len(_MAP)).data != _MAP:
-            raise DeviceError(f"servo bus: {servo.name} did not take the indirect addresses")
+            raise Refused(name, "it did not take the indirect addresses")
         self._shape(bus, servo)
         servo.place(bus.read(name, xc330.PRESENT_POSITION), near)
         volts, degrees = _HEALTH.unpack(bus.read_bytes(name, xc330.PRESENT_VOLTAGE.address, _HEALTH.size).data)
         servo.voltage, servo.temperature = volts * xc330.VOLT_PER_UNIT, float(degrees)
         servo.engaged = False
+        servo.heard_ns = self._clock()
 
     def _shape(self, bus: Bus, servo: _Servo) -> None:
         """Profile and gains, which a change of the operating mode forgets as well."""
@@ -433,7 +442,7 @@ class Dynamixel:
     def _confirm(self, bus: Bus, servo: _Servo, address: int, data: bytes) -> None:
         bus.write_bytes(servo.settings.id, address, data)
         if bus.read_bytes(servo.settings.id, address, len(data)).data != data:
-            raise DeviceError(f"servo bus: {servo.name} did not take what was written to address {address}")
+            raise Refused(servo.settings.id, f"it did not take what was written to address {address}")
 
     def _probe(self, bus: Bus) -> bool:
         """Whether the servos answer a fast sync read; told if not."""
@@ -458,7 +467,7 @@ class Dynamixel:
         while not self._stopping:
             self._wake.wait(self._rest())
             self._wake.clear()
-            command, self._command = self._command, None
+            command = self._fresh()
             try:
                 if self._bus is None:
                     self._reopen()
@@ -467,10 +476,15 @@ class Dynamixel:
             except OSError as error:
                 self._lose(error)
         if self._bus is not None:
-            try:
+            with suppress(OSError):
                 self._relax(self._bus)
-            except OSError:
-                pass
+
+    def _fresh(self) -> ServoCommand | None:
+        """The command that waits, if it is not from before this process was stopped."""
+        given, self._command = self._command, None
+        if given is None or self._clock() - given[1] > self._settings.patience * 1e9:
+            return None
+        return given[0]
 
     def _rest(self) -> float:
         """How long to wait for a command, s."""
@@ -495,12 +509,19 @@ class Dynamixel:
             if self._settings.patience < quiet < until:
                 self._leave_silent(quiet)
                 return
+            if quiet >= until and self._left_silent:
+                self._left_silent = False
+                self._make_sure(bus)
         if self._began_ns is not None:
             self._period.add(now - self._began_ns)
         self._began_ns = now
         try:
             if command is not None:
                 self._apply(bus, command, now)
+        except BusError as error:
+            self._tell_once("apply", Level.WARNING, f"a command did not reach servo {error.servo}: {error}")
+            self._count(error)
+        try:
             self._read(bus)
         except BusError as error:
             self._count(error)
@@ -518,6 +539,13 @@ class Dynamixel:
             f"no command for {quiet * 1e3:.0f} ms: the bus is left silent so that the servos' watchdog stops them",
         )
 
+    def _make_sure(self, bus: Bus) -> None:
+        """The 330 size was seen to run on after the watchdog's trip: take the torque of those in current mode."""
+        servos = [servo for servo in self._servos if servo.engaged and servo.mode is Mode.CURRENT]
+        self._all(bus, servos, xc330.TORQUE_ENABLE, lambda servo: 0)
+        for servo in servos:
+            servo.engaged, servo.interrupted = False, True
+
     # -- commands -------------------------------------------------------------------------------------------------
 
     def _apply(self, bus: Bus, command: ServoCommand, now: int) -> None:
@@ -530,6 +558,7 @@ class Dynamixel:
             servo
             for servo in self._servos
             if servo.answers
+            and not servo.suspect
             and not servo.error & _SHUT_DOWN
             and not (servo.engaged and servo.mode is self._mode_of(servo, joint))
         ]
@@ -538,7 +567,9 @@ class Dynamixel:
         dt = min((now - self._goals_ns) * 1e-9, 0.1)
         self._goals_ns = now
         goals = {
-            servo.settings.id: self._goal(servo, command, now, dt) for servo in self._servos if servo.engaged and servo.answers
+            servo.settings.id: self._goal(servo, command, now, dt)
+            for servo in self._servos
+            if servo.engaged and servo.answers
         }
         if goals:
             bus.sync_write(_WRITE_AT, _WRITE.size, goals)
@@ -579,7 +610,7 @@ class Dynamixel:
             self._all(bus, switched, xc330.OPERATING_MODE, lambda servo: self._mode_of(servo, joint))
             for servo in switched:
                 if bus.read(servo.settings.id, xc330.OPERATING_MODE) != self._mode_of(servo, joint):
-                    raise BusError(servo.settings.id, "the operating mode was not taken")
+                    raise Refused(servo.settings.id, "it did not take the operating mode")
                 self._shape(bus, servo)
                 servo.mode = self._mode_of(servo, joint)
         # A watchdog that has tripped locks the goals.
@@ -604,7 +635,8 @@ class Dynamixel:
             servo.engaged = servo.interrupted = False
 
     def _all(self, bus: Bus, servos: Iterable[_Servo], item: Item, value: Callable[[_Servo], int]) -> None:
-        bus.sync_write(item.address, item.size, {servo.settings.id: item.encode(value(servo)) for servo in servos})
+        if data := {servo.settings.id: item.encode(value(servo)) for servo in servos}:
+            bus.sync_write(item.address, item.size, data)
 
     # -- samples --------------------------------------------------------------------------------------------------
 
@@ -644,7 +676,6 @@ class Dynamixel:
             answer = bus.read_bytes(servo.settings.id, _READ_AT, _READ.size)
         except BusError as error:
             self._count(error)
-            servo.suspect = True
             return False
         return self._take(servo, answer.data)
 
@@ -739,6 +770,9 @@ class Dynamixel:
                     servo.retry_ns = now + round(self._settings.retry * 1e9)
                     self._revive(bus, servo)
                     return
+            except Refused as error:
+                self._tell_once(f"set up {servo.index}", Level.ERROR, f"{servo.name}: {error}")
+                return
             except BusError:
                 return
         if now >= self._health_ns:
@@ -753,7 +787,6 @@ class Dynamixel:
             answer = bus.read_bytes(servo.settings.id, xc330.PRESENT_VOLTAGE.address, _HEALTH.size)
         except BusError as error:
             self._count(error)
-            servo.suspect = True
             return
         volts, degrees = _HEALTH.unpack(answer.data)
         servo.voltage, servo.temperature = volts * xc330.VOLT_PER_UNIT, float(degrees)
@@ -772,11 +805,7 @@ class Dynamixel:
         name = servo.settings.id
         mark = bus.read_bytes(name, _READ_AT, 1).data[0]
         if mark != _MARK:
-            try:
-                self._prepare(bus, servo, servo.position)
-            except DeviceError as error:
-                self._tell_once(f"set up {servo.index}", Level.ERROR, str(error))
-                return
+            self._prepare(bus, servo, servo.position)
         servo.answers = True
         servo.heard_ns = self._clock()
         servo.error = 0
@@ -806,9 +835,12 @@ class Dynamixel:
     # -- telling --------------------------------------------------------------------------------------------------
 
     def _count(self, error: BusError) -> None:
-        self._errors[_KINDS.get(type(error).__name__, "refused")] += 1
-        if error.servo is not None:
-            self._errors[f"servo {error.servo}"] += 1
+        kinds = {NoAnswer: "no answer", Corrupt: "corrupt"}
+        self._errors[kinds.get(type(error), "refused")] += 1
+        for servo in self._servos:
+            if servo.settings.id == error.servo:
+                self._errors[servo.name] += 1
+                servo.suspect = True
 
     def _tell(self, level: Level, text: str) -> None:
         self._notices.tell(self._clock(), level, text)
@@ -822,9 +854,6 @@ class Dynamixel:
             return
         self._told[key] = (now, 0)
         self._tell(level, f"{text} (and {more} times since it was last told)" if more else text)
-
-
-_KINDS = {"NoAnswer": "no answer", "Corrupt": "corrupt"}
 
 
 def _five(values: Iterable[float]) -> Five:

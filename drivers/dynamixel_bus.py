@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import select
+import termios
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
@@ -55,7 +56,7 @@ class Corrupt(BusError):  # noqa: N818 - as above
 
 
 class Refused(BusError):  # noqa: N818 - as above
-    """The servo answered with an error number."""
+    """The servo answered with an error number, or does not show what was written to it."""
 
 
 class Answer(Struct, frozen=True, gc=False):
@@ -85,24 +86,29 @@ class Port:
         """Let the port go; safe to call twice, and when the adapter is gone."""
         self._serial.close()
 
-    # What dynamixel-sdk calls, by its names.
-
-    def getBaudRate(self) -> int:
-        return self._baud
-
-    def clearPort(self) -> None:
-        """Forget what came late."""
-        self._serial.reset_input_buffer()
-
-    def writePort(self, packet: Sequence[int]) -> int:
-        self._sent = len(packet)
-        return os.write(self._fd, bytes(packet))
-
     def quieten(self) -> None:
         """Forget what is still on its way: wait until nothing has come for a moment."""
         while select.select([self._fd], [], [], _QUIET)[0]:
             if not os.read(self._fd, 4096):
                 raise OSError("the serial adapter is gone")
+
+    # What dynamixel-sdk calls, by its names.
+
+    def getBaudRate(self) -> int:
+        """Bits per second."""
+        return self._baud
+
+    def clearPort(self) -> None:
+        """Forget what came late."""
+        try:
+            self._serial.reset_input_buffer()
+        except termios.error as error:
+            raise OSError(*error.args) from error
+
+    def writePort(self, packet: Sequence[int]) -> int:
+        """Bytes that went out."""
+        self._sent = len(packet)
+        return os.write(self._fd, bytes(packet))
 
     def readPort(self, length: int) -> bytes:
         """Up to ``length`` bytes, at least one; none once the answer is overdue."""
@@ -116,13 +122,16 @@ class Port:
         return data
 
     def setPacketTimeout(self, packet_length: int) -> None:
+        """An answer of so many bytes is overdue after its time, and the question's, on the wire and the margin."""
         wire = (self._sent + packet_length) * _BITS_PER_BYTE / self._baud
         self._deadline = monotonic() + wire + self.margin
 
     def setPacketTimeoutMillis(self, milliseconds: float) -> None:
+        """The answer is overdue after this."""
         self._deadline = monotonic() + milliseconds * 1e-3
 
     def isPacketTimeout(self) -> bool:
+        """The answer is overdue."""
         return monotonic() >= self._deadline
 
 
@@ -131,7 +140,9 @@ def _open(path: str, baud: int) -> Any:
     try:
         return serial.Serial(path, baud, timeout=0, exclusive=True)
     except FileNotFoundError as error:
-        raise DeviceError(f"{where}: it is not there; is the adapter plugged in, and is the udev rule in place?") from error
+        raise DeviceError(
+            f"{where}: it is not there; is the adapter plugged in, and is the udev rule in place?"
+        ) from error
     except serial.SerialException as error:
         if not Path(path).exists():
             hint = "it is not there; is the adapter plugged in, and is the udev rule in place?"
@@ -303,4 +314,3 @@ def wire_time(baud: int, servos: int, read: int, written: int, fast: bool = True
     answer = 8 + servos * (read + 4) if fast else servos * (read + _STATUS)
     write = _INSTRUCTION + 4 + servos * (1 + written) if written else 0
     return (ask + answer + write) * _BITS_PER_BYTE / baud + return_delay * (1 if fast else servos)
-

@@ -168,5 +168,6 @@ _INDIRECT = tuple(
 
 #: Every item, by address.
 TABLE: dict[int, Item] = {
-    item.address: item for item in (*(value for value in list(globals().values()) if isinstance(value, Item)), *_INDIRECT)
+    item.address: item
+    for item in (*(value for value in list(globals().values()) if isinstance(value, Item)), *_INDIRECT)
 }

@@ -246,7 +246,7 @@ class DynamixelBus:
         reply = b""
         if fast and asked:
             # One status packet that the servos build together; nothing in it is stuffed.
-            length = 3 - 2 + sum(size + 4 for _, _, size in asked)
+            length = 1 + sum(size + 4 for _, _, size in asked)
             reply = b"\xff\xff\xfd\x00" + bytes((BROADCAST,)) + length.to_bytes(2, "little") + bytes((STATUS,))
         for name, address, size in asked:
             servo = awake.get(name)
@@ -396,7 +396,9 @@ class DynamixelEmulator:
                 new.symlink_to(self._path)
                 new.replace(self._link)
             except OSError as error:
-                raise DeviceError(f"servo bus emulator: cannot make the link {self._link} ({error.strerror})") from error
+                raise DeviceError(
+                    f"servo bus emulator: cannot make the link {self._link} ({error.strerror})"
+                ) from error
 
     def _unplug(self) -> None:
         if self._fds is None:

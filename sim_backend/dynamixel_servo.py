@@ -16,7 +16,7 @@ from sim_backend.dynamixel_wire import ALERT, Trouble
 
 _POSITIONED = (Mode.POSITION, Mode.EXTENDED_POSITION, Mode.CURRENT_BASED_POSITION)
 _GOALS = (x.GOAL_PWM, x.GOAL_CURRENT, x.GOAL_VELOCITY, x.GOAL_POSITION)
-_GOAL_PLACES = {item.address for item in _GOALS}
+_LIMITS = {x.GOAL_PWM: x.PWM_LIMIT, x.GOAL_CURRENT: x.CURRENT_LIMIT, x.GOAL_VELOCITY: x.VELOCITY_LIMIT}
 _MODES = tuple(int(mode) for mode in Mode)
 #: Gains that a change of the operating mode sets anew.
 _GAINS = (x.VELOCITY_I, x.VELOCITY_P, x.POSITION_D, x.POSITION_I, x.POSITION_P, x.FEEDFORWARD_2, x.FEEDFORWARD_1)
@@ -76,6 +76,8 @@ class Servo:
     def __init__(self, servo: int, firmware: int = 52, reboot_time: float = 0.15) -> None:
         self._reboot_time = reboot_time
         self._settled: _Settled | None = None
+        self._map: tuple[int, ...] | None = None
+        self._splits: dict[tuple[int, int], list[Item] | Trouble] = {}
         self._registers = bytearray(x.SIZE)
         for item in x.TABLE.values():
             self._put(item, item.initial)
@@ -231,8 +233,10 @@ class Servo:
         if length < 1 or address + length > x.SIZE:
             return Trouble.ACCESS, b""
         data = bytearray(self._registers[address : address + length])
-        for k in range(max(address, x.INDIRECT_DATA), address + length):
-            data[k - address] = self._registers[self._behind(k)]
+        if address + length > x.INDIRECT_DATA:
+            places = self._behind()
+            for k in range(max(address, x.INDIRECT_DATA), address + length):
+                data[k - address] = self._registers[places[k - x.INDIRECT_DATA]]
         return Trouble.NONE, bytes(data)
 
     def write(self, address: int, data: bytes) -> int:
@@ -247,8 +251,8 @@ class Servo:
 
     def reaches_goal(self, address: int, length: int) -> bool:
         """A write there sets a goal, directly or through the indirect addresses."""
-        places = (self._behind(k) if k >= x.INDIRECT_DATA else k for k in range(address, address + length))
-        return any(place in _GOAL_PLACES for place in places)
+        items = self._items(address, length)
+        return not isinstance(items, Trouble) and any(item in _GOALS for item in items)
 
     def register(self, address: int, data: bytes) -> int:
         """Reg write: keep it for the action."""
@@ -271,6 +275,7 @@ class Servo:
         for item in x.TABLE.values():
             if item.address >= x.RAM:
                 self._put(item, item.initial)
+        self._forget_map()
         self._registered = None
         self._turns = 0
         counts = self._counts(self._motion.position)
@@ -313,24 +318,45 @@ class Servo:
     def _counts(self, position: float) -> int:
         return round(position / x.RAD_PER_COUNT) + self._turns * x.COUNTS + self.get(x.HOMING_OFFSET)
 
-    def _behind(self, address: int) -> int:
-        """The address that an indirect-data byte stands for."""
-        item = x.TABLE[x.INDIRECT_ADDRESS + 2 * (address - x.INDIRECT_DATA)]
-        return self.get(item)
+    def _behind(self) -> tuple[int, ...]:
+        """The addresses that the bytes of the indirect data stand for."""
+        if self._map is None:
+            self._map = tuple(self.get(x.TABLE[x.INDIRECT_ADDRESS + 2 * k]) for k in range(x.INDIRECT_COUNT))
+        return self._map
+
+    def _items(self, address: int, length: int) -> list[Item] | Trouble:
+        """The items that a write of so many bytes goes to."""
+        split = self._splits.get((address, length))
+        if split is None:
+            split = self._splits[address, length] = self._find_items(address, length)
+        return split
+
+    def _find_items(self, address: int, length: int) -> list[Item] | Trouble:
+        end = address + length
+        if not length:
+            return Trouble.DATA_LENGTH
+        if end > x.SIZE:
+            return Trouble.ACCESS
+        behind = self._behind()
+        places = [behind[k - x.INDIRECT_DATA] if k >= x.INDIRECT_DATA else k for k in range(address, end)]
+        items: list[Item] = []
+        while places:
+            item = x.TABLE.get(places[0])
+            if item is None or not item.writable:
+                return Trouble.ACCESS
+            if places[: item.size] != list(range(item.address, item.address + item.size)):
+                return Trouble.DATA_LENGTH
+            items.append(item)
+            del places[: item.size]
+        return items
 
     def _split(self, address: int, data: bytes) -> tuple[list[tuple[Item, int]], int]:
         """The items that a write goes to, with their values; or an error number."""
-        if not data:
-            return [], Trouble.DATA_LENGTH
-        places = [self._behind(k) if k >= x.INDIRECT_DATA else k for k in range(address, address + len(data))]
-        writes: list[tuple[Item, int]] = []
-        k = 0
-        while k < len(places):
-            item = x.TABLE.get(places[k])
-            if item is None or not item.writable:
-                return [], Trouble.ACCESS
-            if places[k : k + item.size] != list(range(item.address, item.address + item.size)):
-                return [], Trouble.DATA_LENGTH
+        items = self._items(address, len(data))
+        if isinstance(items, Trouble):
+            return [], items
+        writes, k = [], 0
+        for item in items:
             writes.append((item, item.decode(data[k : k + item.size])))
             k += item.size
         return writes, Trouble.NONE
@@ -342,11 +368,7 @@ class Servo:
             return Trouble.DATA_RANGE
         if not item.low <= value <= item.high or (item is x.OPERATING_MODE and value not in _MODES):
             return Trouble.DATA_RANGE
-        limit = {
-            x.GOAL_PWM.address: x.PWM_LIMIT,
-            x.GOAL_CURRENT.address: x.CURRENT_LIMIT,
-            x.GOAL_VELOCITY.address: x.VELOCITY_LIMIT,
-        }.get(item.address)
+        limit = _LIMITS.get(item)
         if limit is not None and abs(value) > self.get(limit):
             return Trouble.DATA_LIMIT
         if item is x.GOAL_POSITION and self.get(x.OPERATING_MODE) == Mode.POSITION:
@@ -359,11 +381,19 @@ class Servo:
 
     def _set(self, item: Item, value: int) -> None:
         before = self.get(item)
+        if value == before:
+            return
         self._put(item, value)
-        if item is x.OPERATING_MODE and value != before:
+        if item is x.OPERATING_MODE:
             self._reset_mode()
-        elif item is x.TORQUE_ENABLE and value and not before:
+        elif item is x.TORQUE_ENABLE and value:
             self._hold(self._counts(self._motion.position))
+        elif item.address >= x.INDIRECT_ADDRESS:
+            self._forget_map()
+
+    def _forget_map(self) -> None:
+        self._map = None
+        self._splits.clear()
 
     def _reset_mode(self) -> None:
         for gain in _GAINS:
