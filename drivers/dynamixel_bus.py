@@ -25,7 +25,7 @@ from drivers.xc330 import Item
 T = TypeVar("T")
 
 _BITS_PER_BYTE = 10
-_QUIET = 0.001  # s
+_QUIET = 0.25  # of the reply margin: how long nothing may come until the line is taken for quiet
 _ALERT = 0x80
 _ERROR_NUMBERS = {
     1: "the instruction failed",
@@ -70,7 +70,7 @@ class Answer(Struct, frozen=True, gc=False):
 class Port:
     """A serial port with the calls that dynamixel-sdk makes of one. Raises OSError once the adapter is gone.
 
-    ``reply_margin`` is how long an answer may take beyond its time on the wire, s.
+    ``reply_margin`` is how long an answer may take beyond its time on the wire and in the adapter, s.
     """
 
     def __init__(self, path: str, baud: int, reply_margin: float) -> None:
@@ -80,6 +80,7 @@ class Port:
         self._deadline = 0.0
         self._sent = 0
         self._serial = _open(path, baud)
+        self._latency = latency_timer(path)
         self._fd = self._serial.fileno()
 
     def close(self) -> None:
@@ -88,7 +89,7 @@ class Port:
 
     def quieten(self) -> None:
         """Forget what is still on its way: wait until nothing has come for a moment."""
-        while select.select([self._fd], [], [], _QUIET)[0]:
+        while select.select([self._fd], [], [], _QUIET * self.margin)[0]:
             if not os.read(self._fd, 4096):
                 raise OSError("the serial adapter is gone")
 
@@ -124,7 +125,7 @@ class Port:
     def setPacketTimeout(self, packet_length: int) -> None:
         """An answer of so many bytes is overdue after its time, and the question's, on the wire and the margin."""
         wire = (self._sent + packet_length) * _BITS_PER_BYTE / self._baud
-        self._deadline = monotonic() + wire + self.margin
+        self._deadline = monotonic() + wire + self._latency + self.margin
 
     def setPacketTimeoutMillis(self, milliseconds: float) -> None:
         """The answer is overdue after this."""
@@ -157,20 +158,27 @@ def _open(path: str, baud: int) -> Any:
         raise DeviceError(f"{where} at {baud} baud ({error})") from error
 
 
-def latency_hint(path: str, sysfs: Path = _SYSFS) -> str | None:
-    """What to do about the latency timer of the FTDI chip behind ``path``; None when it is short or there is none."""
-    name = Path(path).resolve().name
-    timer = sysfs / name / "latency_timer"
+def latency_timer(path: str, sysfs: Path = _SYSFS) -> float:
+    """How long the FTDI chip behind ``path`` holds bytes back to send them together, s; 0 where there is none."""
     try:
-        value = int(timer.read_text(encoding="ascii"))
+        return int(_timer(path, sysfs).read_text(encoding="ascii")) * 1e-3
     except (OSError, ValueError):
-        return None
-    if value <= 1:
+        return 0.0
+
+
+def latency_hint(path: str, sysfs: Path = _SYSFS) -> str | None:
+    """What to do about a latency timer that is too long; None when it is not."""
+    value = latency_timer(path, sysfs)
+    if value <= 0.001:
         return None
     return (
-        f"the adapter's latency timer is {value} ms, so that a bus cycle lasts at least that long: "
-        f"echo 1 | sudo tee {timer}, or install the udev rule that sets it to 1 ms"
+        f"the adapter's latency timer is {value * 1e3:.0f} ms, so that a bus cycle lasts at least that long: "
+        f"echo 1 | sudo tee {_timer(path, sysfs)}, or install the udev rule that sets it to 1 ms"
     )
+
+
+def _timer(path: str, sysfs: Path) -> Path:
+    return sysfs / Path(path).resolve().name / "latency_timer"
 
 
 class Bus:
