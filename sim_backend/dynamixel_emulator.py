@@ -10,10 +10,11 @@ open, in a thread of its own. The servos move with a simulated world (``WorldSer
 from __future__ import annotations
 
 import argparse
+import fcntl
 import os
 import select
+import struct
 import sys
-import termios
 import tty
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -37,7 +38,10 @@ from sim_backend.world import World
 
 _BITS_PER_BYTE = 10
 _TICK = 0.005
-_SPEEDS = {getattr(termios, f"B{baud}"): number for number, baud in enumerate(xc330.BAUDS)}
+# Linux: struct termios2, which has the speed as a number however the client has set it; the last field is for output.
+_TCGETS2 = 0x802C542A
+_TERMIOS2 = struct.Struct("4IB19s2I")
+_SPEED_TOLERANCE = 0.03
 _READS = (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ, Instruction.BULK_READ, Instruction.FAST_BULK_READ)
 
 
@@ -415,11 +419,11 @@ class DynamixelEmulator:
         except BlockingIOError:
             return
         arrived = monotonic()
-        speed = _SPEEDS.get(termios.tcgetattr(master)[5], -1)
-        per_byte = _BITS_PER_BYTE / xc330.BAUDS[speed] if self._wire and speed >= 0 else 0.0
+        speed = _line_speed(master)
+        per_byte = _BITS_PER_BYTE / speed if self._wire and speed else 0.0
         self._free_at = max(self._free_at, arrived) + per_byte * len(data)
         for packet in self._parser.feed(data):
-            reply, delay = self.bus.handle(packet, monotonic(), speed)
+            reply, delay = self.bus.handle(packet, monotonic(), _baud_number(speed))
             if not reply:
                 continue
             self._free_at += per_byte * len(reply) + (delay if self._wire else 0.0) + self.bus.hold_back()
@@ -428,6 +432,19 @@ class DynamixelEmulator:
                 sleep(rest)
             with suppress(BlockingIOError):  # nobody reads: the bits are gone, as on a wire
                 os.write(master, reply)
+
+
+def _line_speed(master: int) -> int:
+    """Bits per second that the client has set."""
+    return int(_TERMIOS2.unpack(fcntl.ioctl(master, _TCGETS2, bytes(_TERMIOS2.size)))[-1])
+
+
+def _baud_number(speed: int) -> int:
+    """The baud rate as the servos count them, or -1."""
+    for number, baud in enumerate(xc330.BAUDS):
+        if abs(speed - baud) <= _SPEED_TOLERANCE * baud:
+            return number
+    return -1
 
 
 def emulate(

@@ -45,12 +45,24 @@ def test_items_are_where_the_manual_has_them(item: xc330.Item, address: int, siz
 
 
 def test_units() -> None:
-    assert xc330.COUNTS * xc330.RAD_PER_COUNT == pytest.approx(2.0 * pi)
-    assert 354 * xc330.RAD_S_PER_UNIT == pytest.approx(8.49, abs=0.01)  # no-load speed, 81 rev/min at 5 V
-    assert 60 * xc330.RAD_S2_PER_UNIT == pytest.approx(214.577 * 2.0 * pi / 60.0)
-    assert 1800 * xc330.AMPERE_PER_UNIT == pytest.approx(1.8)
-    assert 50 * xc330.VOLT_PER_UNIT == pytest.approx(5.0)
-    assert 5 * xc330.S_PER_WATCHDOG_UNIT == pytest.approx(0.1)
+    units = {
+        "turn": 4096 * xc330.RAD_PER_COUNT,
+        "no-load speed, 81 rev/min at 5 V": 354 * xc330.RAD_S_PER_UNIT,
+        "acceleration": 60 * xc330.RAD_S2_PER_UNIT,
+        "stall current": 1800 * xc330.AMPERE_PER_UNIT,
+        "supply": 50 * xc330.VOLT_PER_UNIT,
+        "watchdog": 5 * xc330.S_PER_WATCHDOG_UNIT,
+        "return delay of the factory": 250 * xc330.S_PER_DELAY_UNIT,
+    }
+    assert units == {
+        "turn": pytest.approx(2.0 * pi),
+        "no-load speed, 81 rev/min at 5 V": pytest.approx(81.0 * 2.0 * pi / 60.0, rel=2e-3),
+        "acceleration": pytest.approx(214.577 * 2.0 * pi / 60.0),
+        "stall current": pytest.approx(1.8),
+        "supply": pytest.approx(5.0),
+        "watchdog": pytest.approx(0.1),
+        "return delay of the factory": pytest.approx(500e-6),
+    }
 
 
 @given(st.sampled_from(sorted(xc330.TABLE)), st.data())

@@ -447,7 +447,7 @@ def test_faults_spoil_so_many_answers_and_no_more() -> None:
     wire.bus.truncate = 1
     assert wire.ask(ping) == sound[: len(sound) // 2]
     wire.bus.wrong_id = 2
-    assert list(Parser().feed(wire.ask(ping)))[0] == Packet(0x41, 0x55, sound[8:-2], True)
+    assert next(Parser().feed(wire.ask(ping))) == Packet(0x41, 0x55, sound[8:-2], True)
     fast = wire.ask(packet(BROADCAST, Instruction.FAST_SYNC_READ, b"\x84\x00\x04\x00\x01\x02"))
     assert fast[9] == 0x41
     assert crc_bytes(fast[:-2]) == fast[-2:]
@@ -456,9 +456,12 @@ def test_faults_spoil_so_many_answers_and_no_more() -> None:
 
 # -- a simulated world ----------------------------------------------------------------------------------------------
 
-MOUNTING = tuple(
-    ServoSettings(id=10 + k, zero=zero, sign=sign)
-    for k, (zero, sign) in enumerate([(1000, 1), (3000, -1), (2048, -1), (500, 1), (2048, -1)])
+MOUNTING = (
+    ServoSettings(id=10, zero=1000),
+    ServoSettings(id=11, zero=3000, sign=-1),
+    ServoSettings(id=12, zero=2048, sign=-1),
+    ServoSettings(id=13, zero=500),
+    ServoSettings(id=14, zero=2048, sign=-1),
 )
 
 
