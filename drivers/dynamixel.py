@@ -464,6 +464,14 @@ class Dynamixel:
     # -- the thread -----------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        try:
+            self._work()
+        except Exception as error:
+            # Nothing more is sent, so that the servos' watchdog stops them.
+            self._tell(Level.ERROR, f"the servo driver has failed: {error!r}")
+            raise
+
+    def _work(self) -> None:
         while not self._stopping:
             self._wake.wait(self._rest())
             self._wake.clear()
