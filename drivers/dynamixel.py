@@ -11,76 +11,24 @@ was seen to set the motor off (ROBOTIS-GIT/DynamixelSDK #584).
 from __future__ import annotations
 
 import asyncio
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from math import isfinite
 from threading import Event, Thread
 from time import monotonic_ns
-from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Struct
 
 from drivers import xc330
 from drivers.dynamixel_bus import Bus, BusError, Corrupt, NoAnswer, Port, Refused, latency_hint
+from drivers.dynamixel_settings import DynamixelSettings
+from drivers.dynamixel_setup import HEALTH, MARK, READ, READ_AT, SHUT_DOWN, WRITE, WRITE_AT, Servo, SetUp
 from drivers.mailbox import Level, Mailbox, MailboxCounts, Notice, Notices
 from drivers.protocols import DeviceError
-from drivers.samples import SERVO_NAMES, Five, JointMode, ServoCommand, ServoState
+from drivers.samples import Five, JointMode, ServoCommand, ServoState
 from drivers.spread import Spread, Summary
 from drivers.xc330 import HardwareError, Item, Mode
-
-
-def _meta(unit: str, doc: str, low: float, high: float) -> Meta:
-    return Meta(ge=low, le=high, description=doc, extra={"unit": unit, "in_flight": False})
-
-
-Gain = Annotated[int, _meta("1", "of the position loop, in the control table's scale", 0, 16_383)]
-
-
-class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """One servo: where it is on the bus, how it is mounted, what it may do."""
-
-    id: Annotated[int, _meta("1", "on the bus", 0, 252)]
-    zero: Annotated[int, _meta("counts", "encoder reading at angle 0", -1_000_000, 1_000_000)] = 2048
-    sign: Annotated[Literal[1, -1], Meta(description="1: the angle grows with the encoder's counts")] = 1
-    center: Annotated[float, _meta("rad", "when switched on, the angle is within half a turn of this", -6.3, 6.3)] = 0.0
-    torque_constant: Annotated[
-        float, _meta("N m/A", "torque at the output per supply current; stall 0.93 N m at 1.80 A", 0.05, 5.0)
-    ] = 0.93 / 1.80
-    current_limit: Annotated[
-        float, _meta("A", "no goal exceeds it; below what trips the overload shutdown", 0, 2.352)
-    ] = 1.6
-    profile_velocity: Annotated[float, _meta("rad/s", "in position mode; 0: no profile", 0.0, 49.0)] = 0.0
-    profile_acceleration: Annotated[float, _meta("rad/s^2", "in position mode; 0: no profile", 0.0, 12_000.0)] = 0.0
-    gains: tuple[Gain, Gain, Gain] | None = None
-    """P, I, D of the position loop; None leaves those of the firmware."""
-
-
-class DynamixelSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """The bus, its servos in the order of ``SERVO_NAMES``, and how faults are met."""
-
-    port: Annotated[str, Meta(description="serial port: /dev/servos, /dev/ttyUSB0, ...")]
-    servos: tuple[ServoSettings, ServoSettings, ServoSettings, ServoSettings, ServoSettings] = (
-        ServoSettings(1),
-        ServoSettings(2),
-        ServoSettings(3),
-        ServoSettings(4),
-        ServoSettings(5),
-    )
-    baud: Annotated[int, Meta(description="57600, 115200 or 1 to 4 million, as set in the servos")] = 1_000_000
-    period: Annotated[float, _meta("s", "between cycles while nothing is commanded", 0.001, 0.1)] = 0.004
-    patience: Annotated[float, _meta("s", "without a command the bus is left silent after this", 0.005, 1.0)] = 0.030
-    watchdog: Annotated[float, _meta("s", "silence that makes the servos stop; steps of 0.02", 0.02, 2.54)] = 0.10
-    reply_margin: Annotated[float, _meta("s", "answers may be late by this", 0.0005, 0.05)] = 0.004
-    silent_after: Annotated[float, _meta("s", "without an answer until a servo counts as silent", 0.01, 1.0)] = 0.05
-    retry: Annotated[float, _meta("s", "between attempts to find a lost servo or adapter", 0.05, 10.0)] = 0.25
-    health: Annotated[float, _meta("s", "between looks at one servo's voltage and temperature", 0.01, 5.0)] = 0.05
-    temperature_limit: Annotated[int, _meta("degC", "the servo shuts down above it", 0, 100)] = 70
-    reboot_delay: Annotated[float, _meta("s", "from an overload shutdown to the reboot", 0.1, 60.0)] = 1.0
-    reboots: Annotated[int, _meta("1", "after overload, for each servo and start", 0, 100)] = 3
-    homing_speed: Annotated[float, _meta("rad/s", "back to the goal after an interruption", 0.01, 5.0)] = 0.5
-    homing_time: Annotated[float, _meta("s", "torque grows back in this time after an interruption", 0.01, 10.0)] = 1.0
 
 
 class BusStatistics(Struct, frozen=True, gc=False):
@@ -99,92 +47,11 @@ class BusStatistics(Struct, frozen=True, gc=False):
     samples: MailboxCounts
 
 
-# What a cycle reads and writes, laid side by side by the indirect addresses. The status return level is there as a
-# mark: it is always 2, and a servo that has rebooted has forgotten its map and shows 0.
-_MARK = 2
-_READ_ITEMS = (
-    xc330.STATUS_RETURN_LEVEL,
-    xc330.HARDWARE_ERROR,
-    xc330.TORQUE_ENABLE,
-    xc330.BUS_WATCHDOG,
-    xc330.PRESENT_CURRENT,
-    xc330.PRESENT_VELOCITY,
-    xc330.PRESENT_POSITION,
-)
-_WRITE_ITEMS = (xc330.GOAL_CURRENT, xc330.GOAL_POSITION)
-_READ = struct.Struct("<BBBbhii")
-_WRITE = struct.Struct("<hi")
-_READ_AT = xc330.INDIRECT_DATA
-_WRITE_AT = _READ_AT + _READ.size
-_MAP = b"".join(
-    (item.address + k).to_bytes(2, "little") for item in (*_READ_ITEMS, *_WRITE_ITEMS) for k in range(item.size)
-)
-_HEALTH = struct.Struct("<HB")
-
-READ_BYTES, WRITTEN_BYTES = _READ.size, _WRITE.size
-"""Of each servo in each cycle."""
-
-_SHUT_DOWN = HardwareError.OVERHEATING | HardwareError.SHOCK | HardwareError.OVERLOAD
+_ATTEMPTS, _PATIENCE = 3, 0.05  # where time does not press: attempts, and how late an answer may be, s
 _JOINTS = 3
-# Where time does not press: attempts, and how late an answer may be, s.
-_ATTEMPTS, _PATIENCE = 3, 0.05
 _AFTER_TRIP = 0.06  # s: the servos look at their watchdog every 20 ms
 _TELL_AGAIN_NS = 10_000_000_000
 _WAKING = 0.3  # s that a servo needs to restart, generously
-
-
-class _Servo:
-    """What is known of one servo."""
-
-    def __init__(self, index: int, settings: ServoSettings) -> None:
-        self.index = index
-        self.settings = settings
-        self.name = f"{SERVO_NAMES[index]} (id {settings.id})"
-        self.answers = True
-        self.suspect = False
-        """It has missed an answer: it is asked by itself until it answers or counts as silent."""
-        self.asked = 0
-        self.heard_ns = 0
-        self.retry_ns = 0
-        self.offset = settings.zero
-        """Counts at angle 0, in the turn that the servo counts now."""
-        self.mode: Mode | None = None
-        """Operating mode of the servo, as far as known."""
-        self.engaged = False
-        """Torque is on and the watchdog armed, in the right mode."""
-        self.interrupted = False
-        """It was engaged and lost its torque: it goes back slowly."""
-        self.homing: float | None = None
-        """The goal that creeps from where the servo was to what is commanded, rad."""
-        self.ramp_ns: int | None = None
-        """Since when its torque grows back."""
-        self.reboot_ns: int | None = None
-        self.reboots = 0
-        self.position = settings.center
-        self.velocity = 0.0
-        self.current = 0.0
-        self.voltage = 0.0
-        self.temperature = 0.0
-        self.error = 0
-        self.torque_on = False
-
-    def angle(self, counts: int) -> float:
-        return self.settings.sign * (counts - self.offset) * xc330.RAD_PER_COUNT
-
-    def counts(self, angle: float) -> int:
-        counts = self.offset + round(self.settings.sign * angle / xc330.RAD_PER_COUNT)
-        return min(max(counts, -xc330.MULTI_TURN), xc330.MULTI_TURN)
-
-    def limited(self, ampere: float) -> int:
-        most = self.settings.current_limit
-        return int(min(max(ampere, -most), most) / xc330.AMPERE_PER_UNIT)
-
-    def place(self, counts: int, near: float) -> None:
-        """Choose the turn in which the encoder's ``counts`` are nearest to the angle ``near``."""
-        self.offset = self.settings.zero
-        turns = (self.angle(counts) - near) / (xc330.RAD_PER_COUNT * xc330.COUNTS)
-        self.offset += self.settings.sign * round(turns) * xc330.COUNTS
-        self.position = self.angle(counts)
 
 
 class Dynamixel:
@@ -202,7 +69,8 @@ class Dynamixel:
             raise DeviceError(f"servo bus: baud {settings.baud}; want one of {', '.join(map(str, xc330.BAUDS))}")
         self._settings = settings
         self._clock = clock
-        self._servos = tuple(_Servo(index, servo) for index, servo in enumerate(settings.servos))
+        self._servos = tuple(Servo(index, servo) for index, servo in enumerate(settings.servos))
+        self._set_up = SetUp(settings, self._servos, self._tell)
         self._bus: Bus | None = None
         self._fast = True
         self._thread: Thread | None = None
@@ -292,169 +160,15 @@ class Dynamixel:
         bus.patient(_ATTEMPTS, _PATIENCE)
         if hint := latency_hint(settings.port):
             self._tell(Level.WARNING, hint)
-        self._find(bus)
+        self._set_up.find(bus)
         for servo in self._servos:
             try:
-                self._set_up(bus, servo)
+                self._set_up.set_up(bus, servo)
+                servo.heard_ns = self._clock()
             except BusError as error:
                 raise DeviceError(f"servo bus: {servo.name}, while it was being set up: {error}") from error
-        self._fast = self._probe(bus)
+        self._fast = self._set_up.probe(bus)
         bus.patient(1, settings.reply_margin)
-
-    def _find(self, bus: Bus) -> None:
-        """Make sure that every servo is there and is what it should be."""
-        missing, wrong, old = [], [], []
-        for servo in self._servos:
-            try:
-                model = bus.read(servo.settings.id, xc330.MODEL_NUMBER)
-                firmware = bus.read(servo.settings.id, xc330.FIRMWARE)
-            except BusError:
-                missing.append(servo)
-                continue
-            if model != xc330.MODEL:
-                wrong.append(f"{servo.name} is model {model}, want {xc330.MODEL} (XC330-M288-T)")
-            if firmware < xc330.FAST_READ_FIRMWARE:
-                old.append(f"{servo.name} has firmware {firmware}")
-        if len(missing) == len(self._servos):
-            raise DeviceError(self._nobody(bus))
-        if missing:
-            names = ", ".join(servo.name for servo in missing)
-            raise DeviceError(
-                f"servo bus: no answer from {names} on {self._settings.port} at {self._settings.baud} baud; "
-                f"ids that answer: {', '.join(map(str, bus.answering())) or 'none'}"
-            )
-        if wrong:
-            raise DeviceError(f"servo bus: {'; '.join(wrong)}")
-        if old:
-            self._tell(
-                Level.WARNING,
-                f"{', '.join(old)}: fast sync read needs {xc330.FAST_READ_FIRMWARE} (Dynamixel Wizard updates it)",
-            )
-
-    def _nobody(self, bus: Bus) -> str:
-        """What to say when no servo answers; looks for them at the other baud rates."""
-        settings = self._settings
-        bus.close()
-        for baud in xc330.BAUDS:
-            if baud == settings.baud:
-                continue
-            try:
-                other = Bus(Port(settings.port, baud, settings.reply_margin))
-            except DeviceError:
-                continue
-            try:
-                self._bus = other
-                other.read(settings.servos[0].id, xc330.MODEL_NUMBER)
-                return (
-                    f"servo bus: no servo answers on {settings.port} at {settings.baud} baud, but servo "
-                    f"{settings.servos[0].id} does at {baud}: set baud to that, or the servos to {settings.baud}"
-                )
-            except BusError:
-                continue
-            finally:
-                other.close()
-        return (
-            f"servo bus: no servo answers on {settings.port}, at {settings.baud} baud or any other; "
-            "is the 5 V supply on, and is the data cable plugged in?"
-        )
-
-    def _set_up(self, bus: Bus, servo: _Servo) -> None:
-        """Torque off, healthy, everything written that differs, everything read back."""
-        name, mine, settings = servo.settings.id, servo.settings, self._settings
-        error = bus.read(name, xc330.HARDWARE_ERROR)
-        if error:
-            self._tell(Level.WARNING, f"{servo.name}: {xc330.error_words(error)}; rebooting it")
-            bus.reboot(name)
-            self._await(bus, name)
-            if error := bus.read(name, xc330.HARDWARE_ERROR):
-                raise DeviceError(f"servo bus: {servo.name}: {xc330.error_words(error)}, even after a reboot")
-        if bus.read(name, xc330.TORQUE_ENABLE):
-            bus.write(name, xc330.TORQUE_ENABLE, 0)
-        wanted = (
-            # First of all, for the answers to what follows.
-            (xc330.RETURN_DELAY, 0),
-            (xc330.DRIVE_MODE, 0),
-            (xc330.OPERATING_MODE, int(Mode.CURRENT_BASED_POSITION)),
-            (xc330.SHADOW_ID, 255),
-            (xc330.HOMING_OFFSET, 0),
-            (xc330.TEMPERATURE_LIMIT, settings.temperature_limit),
-            (xc330.CURRENT_LIMIT, round(mine.current_limit / xc330.AMPERE_PER_UNIT)),
-            (xc330.STARTUP, 0),
-            (xc330.SHUTDOWN, int(_SHUT_DOWN)),
-        )
-        for item, value in wanted:
-            self._settle(bus, servo, item, value)
-        servo.mode = Mode.CURRENT_BASED_POSITION
-        self._prepare(bus, servo, servo.settings.center)
-
-    def _await(self, bus: Bus, name: int) -> None:
-        """Wait until a rebooted servo answers."""
-        give_up = self._clock() + 2_000_000_000
-        while True:
-            try:
-                bus.read(name, xc330.MODEL_NUMBER)
-                return
-            except NoAnswer:
-                if self._clock() > give_up:
-                    raise
-
-    def _settle(self, bus: Bus, servo: _Servo, item: Item, value: int) -> None:
-        """Write an item if it differs, and see that it took it."""
-        name = servo.settings.id
-        before = bus.read(name, item)
-        if before == value:
-            return
-        bus.write(name, item, value)
-        after = bus.read(name, item)
-        if after != value:
-            raise Refused(name, f"it did not take {item.name} {value}, and shows {after}")
-        self._tell(Level.INFO, f"{servo.name}: {item.name} set from {before} to {value}")
-
-    def _prepare(self, bus: Bus, servo: _Servo, near: float) -> None:
-        """All that a reboot forgets; then look where the servo stands."""
-        name = servo.settings.id
-        if bus.read(name, xc330.STATUS_RETURN_LEVEL) != _MARK:
-            bus.write(name, xc330.STATUS_RETURN_LEVEL, _MARK)
-        bus.write(name, xc330.BUS_WATCHDOG, 0)
-        bus.write_bytes(name, xc330.INDIRECT_ADDRESS, _MAP)
-        if bus.read_bytes(name, xc330.INDIRECT_ADDRESS, len(_MAP)).data != _MAP:
-            raise Refused(name, "it did not take the indirect addresses")
-        self._shape(bus, servo)
-        servo.place(bus.read(name, xc330.PRESENT_POSITION), near)
-        volts, degrees = _HEALTH.unpack(bus.read_bytes(name, xc330.PRESENT_VOLTAGE.address, _HEALTH.size).data)
-        servo.voltage, servo.temperature = volts * xc330.VOLT_PER_UNIT, float(degrees)
-        servo.engaged = False
-        servo.heard_ns = self._clock()
-
-    def _shape(self, bus: Bus, servo: _Servo) -> None:
-        """Profile and gains, which a change of the operating mode forgets as well."""
-        mine = servo.settings
-        profile = (
-            round(mine.profile_acceleration / xc330.RAD_S2_PER_UNIT),
-            round(mine.profile_velocity / xc330.RAD_S_PER_UNIT),
-        )
-        if any(profile):
-            self._confirm(bus, servo, xc330.PROFILE_ACCELERATION.address, struct.pack("<II", *profile))
-        if mine.gains is not None:
-            p, i, d = mine.gains
-            self._confirm(bus, servo, xc330.POSITION_D.address, struct.pack("<HHH", d, i, p))
-
-    def _confirm(self, bus: Bus, servo: _Servo, address: int, data: bytes) -> None:
-        bus.write_bytes(servo.settings.id, address, data)
-        if bus.read_bytes(servo.settings.id, address, len(data)).data != data:
-            raise Refused(servo.settings.id, f"it did not take what was written to address {address}")
-
-    def _probe(self, bus: Bus) -> bool:
-        """Whether the servos answer a fast sync read; told if not."""
-        ids = [servo.settings.id for servo in self._servos]
-        for _ in range(3):
-            try:
-                bus.sync_read(_READ_AT, _READ.size, ids, fast=True)
-                return True
-            except BusError:
-                continue
-        self._tell(Level.WARNING, "the servos do not answer fast sync reads; plain sync reads are used")
-        return False
 
     def _close(self) -> None:
         bus, self._bus = self._bus, None
@@ -567,7 +281,7 @@ class Dynamixel:
             for servo in self._servos
             if servo.answers
             and not servo.suspect
-            and not servo.error & _SHUT_DOWN
+            and not servo.error & SHUT_DOWN
             and not (servo.engaged and servo.mode is self._mode_of(servo, joint))
         ]
         if late:
@@ -580,12 +294,12 @@ class Dynamixel:
             if servo.engaged and servo.answers
         }
         if goals:
-            bus.sync_write(_WRITE_AT, _WRITE.size, goals)
+            bus.sync_write(WRITE_AT, WRITE.size, goals)
 
-    def _mode_of(self, servo: _Servo, joint: Mode) -> Mode:
+    def _mode_of(self, servo: Servo, joint: Mode) -> Mode:
         return joint if servo.index < _JOINTS else Mode.CURRENT_BASED_POSITION
 
-    def _goal(self, servo: _Servo, command: ServoCommand, now: int, dt: float) -> bytes:
+    def _goal(self, servo: Servo, command: ServoCommand, now: int, dt: float) -> bytes:
         if servo.mode is Mode.CURRENT:
             torque = command.torque[servo.index]
             if servo.ramp_ns is not None:
@@ -594,7 +308,7 @@ class Dynamixel:
                 if share >= 1.0:
                     servo.ramp_ns = None
             current = servo.settings.sign * torque / servo.settings.torque_constant
-            return _WRITE.pack(servo.limited(current), servo.counts(servo.position))
+            return WRITE.pack(servo.limited(current), servo.counts(servo.position))
         goal = command.position[servo.index]
         if servo.homing is not None:
             most = self._settings.homing_speed * dt
@@ -605,9 +319,9 @@ class Dynamixel:
             else:
                 goal = servo.homing
         limit = command.current_limit if servo.index < _JOINTS else servo.settings.current_limit
-        return _WRITE.pack(abs(servo.limited(limit)), servo.counts(goal))
+        return WRITE.pack(abs(servo.limited(limit)), servo.counts(goal))
 
-    def _engage(self, bus: Bus, servos: Sequence[_Servo], joint: Mode, now: int) -> None:
+    def _engage(self, bus: Bus, servos: Sequence[Servo], joint: Mode, now: int) -> None:
         """Bring servos to the mode of the command with torque on and the watchdog armed; no goal is given yet."""
         switched = [servo for servo in servos if servo.mode is not self._mode_of(servo, joint)]
         if switched:
@@ -619,13 +333,13 @@ class Dynamixel:
             for servo in switched:
                 if bus.read(servo.settings.id, xc330.OPERATING_MODE) != self._mode_of(servo, joint):
                     raise Refused(servo.settings.id, "it did not take the operating mode")
-                self._shape(bus, servo)
+                self._set_up.shape(bus, servo)
                 servo.mode = self._mode_of(servo, joint)
         # A watchdog that has tripped locks the goals.
         self._all(bus, servos, xc330.BUS_WATCHDOG, lambda servo: 0)
         # A servo enters current mode with its current limit as the goal.
-        rest = {servo.settings.id: _WRITE.pack(0, servo.counts(servo.position)) for servo in servos}
-        bus.sync_write(_WRITE_AT, _WRITE.size, rest)
+        rest = {servo.settings.id: WRITE.pack(0, servo.counts(servo.position)) for servo in servos}
+        bus.sync_write(WRITE_AT, WRITE.size, rest)
         self._all(bus, servos, xc330.TORQUE_ENABLE, lambda servo: 1)
         units = round(self._settings.watchdog / xc330.S_PER_WATCHDOG_UNIT)
         self._all(bus, servos, xc330.BUS_WATCHDOG, lambda servo: units)
@@ -642,7 +356,7 @@ class Dynamixel:
         for servo in self._servos:
             servo.engaged = servo.interrupted = False
 
-    def _all(self, bus: Bus, servos: Iterable[_Servo], item: Item, value: Callable[[_Servo], int]) -> None:
+    def _all(self, bus: Bus, servos: Iterable[Servo], item: Item, value: Callable[[Servo], int]) -> None:
         if data := {servo.settings.id: item.encode(value(servo)) for servo in servos}:
             bus.sync_write(item.address, item.size, data)
 
@@ -666,11 +380,11 @@ class Dynamixel:
         if any(heard):
             self._publish()
 
-    def _read_together(self, bus: Bus, servos: Sequence[_Servo]) -> list[bool]:
+    def _read_together(self, bus: Bus, servos: Sequence[Servo]) -> list[bool]:
         if not servos:
             return []
         try:
-            answers = bus.sync_read(_READ_AT, _READ.size, [servo.settings.id for servo in servos], self._fast)
+            answers = bus.sync_read(READ_AT, READ.size, [servo.settings.id for servo in servos], self._fast)
         except BusError as error:
             # Who is at fault shows when each is asked by itself, in the next cycle.
             self._one_by_one = True
@@ -678,16 +392,16 @@ class Dynamixel:
             raise
         return [self._take(servo, answer.data) for servo, answer in zip(servos, answers, strict=True)]
 
-    def _read_alone(self, bus: Bus, servo: _Servo) -> bool:
+    def _read_alone(self, bus: Bus, servo: Servo) -> bool:
         servo.asked += 1
         try:
-            answer = bus.read_bytes(servo.settings.id, _READ_AT, _READ.size)
+            answer = bus.read_bytes(servo.settings.id, READ_AT, READ.size)
         except BusError as error:
             self._count(error)
             return False
         return self._take(servo, answer.data)
 
-    def _miss(self, lost: Sequence[_Servo]) -> None:
+    def _miss(self, lost: Sequence[Servo]) -> None:
         for servo in lost:
             self._give_up(servo)
         names = ", ".join(servo.name for servo in lost)
@@ -698,7 +412,7 @@ class Dynamixel:
             else "no servo answers any more: is the 5 V supply on, and is the data cable plugged in?",
         )
 
-    def _give_up(self, servo: _Servo) -> None:
+    def _give_up(self, servo: Servo) -> None:
         servo.answers = False
         servo.interrupted = servo.interrupted or servo.engaged
         servo.engaged = servo.suspect = False
@@ -707,10 +421,10 @@ class Dynamixel:
         servo.torque_on = False
         servo.retry_ns = self._clock() + round(self._settings.retry * 1e9)
 
-    def _take(self, servo: _Servo, data: bytes) -> bool:
+    def _take(self, servo: Servo, data: bytes) -> bool:
         """Take what a servo told; False if it has forgotten what it is to tell."""
-        mark, error, torque, watchdog, current, velocity, counts = _READ.unpack(data)
-        if mark != _MARK:
+        mark, error, torque, watchdog, current, velocity, counts = READ.unpack(data)
+        if mark != MARK:
             self._tell(Level.ERROR, f"{servo.name} has restarted by itself: is its supply steady?")
             self._give_up(servo)
             servo.retry_ns = 0
@@ -734,7 +448,7 @@ class Dynamixel:
             servo.engaged, servo.interrupted = False, True
         return True
 
-    def _judge(self, servo: _Servo, error: int) -> None:
+    def _judge(self, servo: Servo, error: int) -> None:
         new = error & ~servo.error
         servo.error = error
         if not new:
@@ -790,16 +504,16 @@ class Dynamixel:
             if servo.answers and not servo.suspect and not self._one_by_one:
                 self._look_at_health(bus, servo)
 
-    def _look_at_health(self, bus: Bus, servo: _Servo) -> None:
+    def _look_at_health(self, bus: Bus, servo: Servo) -> None:
         try:
-            answer = bus.read_bytes(servo.settings.id, xc330.PRESENT_VOLTAGE.address, _HEALTH.size)
+            answer = bus.read_bytes(servo.settings.id, xc330.PRESENT_VOLTAGE.address, HEALTH.size)
         except BusError as error:
             self._count(error)
             return
-        volts, degrees = _HEALTH.unpack(answer.data)
+        volts, degrees = HEALTH.unpack(answer.data)
         servo.voltage, servo.temperature = volts * xc330.VOLT_PER_UNIT, float(degrees)
 
-    def _reboot(self, bus: Bus, servo: _Servo, now: int) -> None:
+    def _reboot(self, bus: Bus, servo: Servo, now: int) -> None:
         servo.reboot_ns = None
         servo.reboots += 1
         self._tell(Level.WARNING, f"{servo.name}: reboot {servo.reboots} of {self._settings.reboots}")
@@ -808,16 +522,16 @@ class Dynamixel:
         servo.interrupted = True
         servo.retry_ns = now + round(_WAKING * 1e9)
 
-    def _revive(self, bus: Bus, servo: _Servo) -> None:
+    def _revive(self, bus: Bus, servo: Servo) -> None:
         """Take a lost servo back if it answers; its place is the one nearest to where it was last seen."""
         name = servo.settings.id
-        mark = bus.read_bytes(name, _READ_AT, 1).data[0]
-        if mark != _MARK:
-            self._prepare(bus, servo, servo.position)
+        mark = bus.read_bytes(name, READ_AT, 1).data[0]
+        if mark != MARK:
+            self._set_up.prepare(bus, servo, servo.position)
         servo.answers = True
         servo.heard_ns = self._clock()
         servo.error = 0
-        self._tell(Level.INFO, f"{servo.name} answers again{', restarted' if mark != _MARK else ''}")
+        self._tell(Level.INFO, f"{servo.name} answers again{', restarted' if mark != MARK else ''}")
 
     def _lose(self, error: OSError) -> None:
         self._errors["adapter lost"] += 1

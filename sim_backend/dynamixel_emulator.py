@@ -27,7 +27,7 @@ from time import monotonic, sleep
 from typing import Protocol
 
 from drivers import xc330
-from drivers.dynamixel import ServoSettings
+from drivers.dynamixel_settings import ServoSettings
 from drivers.protocols import DeviceError
 from drivers.samples import JointMode, ServoCommand
 from drivers.xc330 import HardwareError, Mode

@@ -14,8 +14,8 @@ from typing import Any
 from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 from msgspec import Struct
 
-from drivers.dynamixel import READ_BYTES, WRITTEN_BYTES
 from drivers.dynamixel_bus import Bus, BusError, Port, wire_time
+from drivers.dynamixel_setup import READ_BYTES, WRITTEN_BYTES
 from tests.bench.measure import Stat, stat
 
 IDS = (1, 2, 3, 4, 5)

@@ -15,7 +15,8 @@ import pytest
 import pytest_asyncio
 import yaml
 
-from drivers.dynamixel import Dynamixel, DynamixelSettings, ServoSettings
+from drivers.dynamixel import Dynamixel
+from drivers.dynamixel_settings import DynamixelSettings, ServoSettings
 from drivers.protocols import ServoDevice
 from drivers.samples import Five, JointMode, ServoCommand, ServoState, Vec3
 from drivers.vehicle import Vehicle

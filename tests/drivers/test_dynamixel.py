@@ -22,7 +22,7 @@ import pytest_asyncio
 from msgspec.structs import replace
 
 from drivers import xc330
-from drivers.dynamixel import READ_BYTES, WRITTEN_BYTES, Dynamixel, DynamixelSettings, ServoSettings
+from drivers.dynamixel import Dynamixel
 from drivers.dynamixel_bus import (
     Answer,
     Bus,
@@ -35,6 +35,8 @@ from drivers.dynamixel_bus import (
     latency_timer,
     wire_time,
 )
+from drivers.dynamixel_settings import DynamixelSettings, ServoSettings
+from drivers.dynamixel_setup import READ_BYTES, WRITTEN_BYTES
 from drivers.mailbox import Level, Notice
 from drivers.protocols import DeviceError
 from drivers.samples import JointMode, ServoCommand, ServoState, Vec3

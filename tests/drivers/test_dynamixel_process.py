@@ -11,12 +11,13 @@ from threading import Event
 
 import pytest
 
-from drivers.dynamixel import DynamixelSettings
+from drivers.dynamixel_settings import DynamixelSettings
 from sim_backend.dynamixel_emulator import DynamixelEmulator, emulate
 
 PROCESS = """
 import asyncio, signal, sys
-from drivers.dynamixel import Dynamixel, DynamixelSettings
+from drivers.dynamixel import Dynamixel
+from drivers.dynamixel_settings import DynamixelSettings
 from drivers.samples import JointMode, ServoCommand
 
 stuck = False

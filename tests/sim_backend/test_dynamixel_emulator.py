@@ -16,7 +16,7 @@ from time import monotonic
 import pytest
 
 from drivers import xc330
-from drivers.dynamixel import ServoSettings
+from drivers.dynamixel_settings import ServoSettings
 from drivers.vehicle import Vehicle
 from drivers.xc330 import HardwareError, Item, Mode
 from sim_backend import layout as at
