@@ -141,4 +141,5 @@ U_THRUST = 16  # N; for a velocity: downwards, m/s
 U_BODY_TORQUE = 17  # 3, N m
 U_ATTITUDE = 20  # 4
 U_BODY_RATE = 24  # 3
-DRIVE_SIZE = 27
+U_LIMP = 27  # 5, 1 while that servo's own torque is off
+DRIVE_SIZE = 32

@@ -24,7 +24,7 @@ def joint_torque(x: Array, p: Array, u: Array, k: int, angle: float, rate: float
     ideal = p[at.SERVO_IDEAL] != 0.0
     speed = rate / p[at.NO_LOAD_SPEED]
     motor = 0.0
-    if u[at.U_TORQUE_ON] != 0.0:
+    if u[at.U_TORQUE_ON] != 0.0 and u[at.U_LIMP + k] == 0.0:
         limit = stall
         if u[at.U_POSITION_MODE] != 0.0:
             motor = p[at.SERVO_STIFFNESS] * (u[at.U_GOAL + k] - angle) - p[at.SERVO_DAMPING] * rate
@@ -58,8 +58,9 @@ def stop_torque(p: Array, k: int, angle: float, rate: float) -> float:
 @compiled()
 def tool_servos(x: Array, p: Array, u: Array) -> None:
     """Advance pump and gripper by one step: first-order towards the goal, no faster than the no-load speed."""
-    most = p[at.NO_LOAD_SPEED] * p[at.STEP] if u[at.U_TORQUE_ON] != 0.0 else 0.0
     for k in range(2):
+        driven = u[at.U_TORQUE_ON] != 0.0 and u[at.U_LIMP + 3 + k] == 0.0
+        most = p[at.NO_LOAD_SPEED] * p[at.STEP] if driven else 0.0
         move = p[at.TOOL_SERVO_GAIN] * (u[at.U_GOAL + 3 + k] - x[at.PUMP + k])
         move = min(max(move, -most), most)
         x[at.PUMP + k] += move

@@ -20,6 +20,9 @@ from sim_backend.sensors import SensorParams, Sensors, Snapshot
 
 Array = NDArray[np.float64]
 
+Limp = tuple[bool, bool, bool, bool, bool]
+NONE_LIMP: Limp = (False, False, False, False, False)
+
 #: The autopilot's modes are looked at no less often than this, s.
 MODE_PERIOD = 0.02
 
@@ -76,7 +79,7 @@ class World:
         put_loops(self.plant.p, vehicle, params.loops, params.plant.step)
         self.autopilot = Autopilot(params.autopilot)
         self.sensors = Sensors(params.sensors, vehicle, seed)
-        self._servo_command: ServoCommand | None = None
+        self._servo_command: tuple[ServoCommand, Limp] | None = None
         self.snapshot = self._look(self.plant.x.tolist(), self.plant.last_steps)
         self.sensors.observe(self.snapshot)
         self._truth = (self.snapshot, self.plant.truth())
@@ -95,10 +98,13 @@ class World:
             self._truth = (now, truth)
         return truth
 
-    def command_servos(self, command: ServoCommand) -> None:
-        """Set the goals of the five servos, from the next advance on; one that is not finite is ignored."""
+    def command_servos(self, command: ServoCommand, limp: Limp = NONE_LIMP) -> None:
+        """Set the goals of the five servos, from the next advance on; one that is not finite is ignored.
+
+        ``limp`` are servos that give no torque though the others do.
+        """
         if isfinite(sum(command.torque) + sum(command.position) + command.current_limit):
-            self._servo_command = command
+            self._servo_command = (command, limp)
 
     def advance(self, duration: float) -> None:
         """Advance by ``duration`` seconds, a whole number of physics steps (else ValueError)."""
@@ -108,8 +114,10 @@ class World:
         longest = ceil(MODE_PERIOD / step)
         x[at.CONTACT_PEAK] = 0.0
         x[at.SPECIFIC_FORCE_SUM : at.SPECIFIC_FORCE_SUM + 3] = 0.0
-        command, self._servo_command = self._servo_command, None
-        if command is not None:
+        commanded, self._servo_command = self._servo_command, None
+        if commanded is not None:
+            command, limp = commanded
+            u[at.U_LIMP : at.U_LIMP + 5] = limp
             u[at.U_TORQUE_ON] = command.mode is not JointMode.OFF
             u[at.U_POSITION_MODE] = command.mode is JointMode.POSITION
             u[at.U_TORQUE : at.U_TORQUE + 3] = command.torque

@@ -1,0 +1,211 @@
+"""What every servo device owes, whatever is behind it: one suite, run on each face.
+
+``mock`` runs in simulated time. ``dynamixel`` is the real driver over dynamixel-sdk and a pseudo-terminal to the
+emulated bus of the same world, in real time; it waits for conditions, never for a guessed time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+import pytest_asyncio
+import yaml
+
+from drivers.dynamixel import Dynamixel
+from drivers.dynamixel_settings import DynamixelSettings, ServoSettings
+from drivers.protocols import ServoDevice
+from drivers.samples import Five, JointMode, ServoCommand, ServoState, Vec3
+from drivers.vehicle import Vehicle
+from sim_backend.dynamixel_emulator import emulate
+from sim_backend.mock_devices import MockServos
+from sim_backend.world import World
+
+pytestmark = pytest.mark.asyncio
+
+VEHICLE = msgspec.convert(
+    yaml.safe_load((Path(__file__).parents[2] / "configs" / "vehicle.yaml").read_text(encoding="utf-8")), Vehicle
+)
+TICK = 0.004
+STILL: Vec3 = (0.0, 0.0, 0.0)
+#: As the arm might be put together: zeros anywhere, two servos the other way round.
+MOUNTING = (
+    ServoSettings(id=1, zero=3300, center=-1.15),
+    ServoSettings(id=2, zero=2600, sign=-1),
+    ServoSettings(id=3, zero=3000, center=-1.0),
+    ServoSettings(id=4, zero=100),
+    ServoSettings(id=5, zero=2000, sign=-1),
+)
+
+
+class Rig:
+    """One device on one world; every tick advances the world."""
+
+    def __init__(self, device: ServoDevice, world: World) -> None:
+        self.device = device
+        self.world = world
+
+    async def tick(self) -> None:
+        self.world.advance(TICK)
+
+    async def until(
+        self, condition: Callable[[], bool], what: Callable[[], ServoCommand] | None = None, within: float = 20.0
+    ) -> None:
+        """Command ``what`` in every tick (nothing: stay silent) until the condition holds."""
+        for _ in range(round(within / TICK)):
+            if condition():
+                return
+            if what is not None:
+                self.device.command(what())
+            await self.tick()
+        pytest.fail(f"not within {within} s; the state is {self.device.latest()}, the truth {self.true()}")
+
+    def state(self) -> ServoState:
+        state = self.device.latest()
+        assert state is not None
+        return state
+
+    def true(self) -> Five:
+        truth = self.world.truth()
+        return (*truth.joints, truth.pump, truth.gripper)
+
+    def hold(self, *moves: float) -> Callable[[], ServoCommand]:
+        """Position goals, from where all stand now."""
+        a, b, c, d, e = (angle + move for angle, move in zip(self.true(), moves or (0.0,) * 5, strict=True))
+        command = ServoCommand(JointMode.POSITION, STILL, (a, b, c, d, e), 1.5)
+        return lambda: command
+
+
+class RealTimeRig(Rig):
+    async def tick(self) -> None:
+        self.world.advance(TICK)
+        await asyncio.sleep(TICK)
+
+
+@pytest_asyncio.fixture(params=["mock", "dynamixel"])
+async def rig(request: pytest.FixtureRequest) -> AsyncIterator[Rig]:
+    world = World(VEHICLE)
+    if request.param == "mock":
+        mock = MockServos(world)
+        await mock.start()
+        yield Rig(mock, world)
+        await mock.stop()
+        return
+    emulator = emulate(MOUNTING, world=world)
+    emulator.start()
+    # Patient, for machines that are busy with other things.
+    settings = DynamixelSettings(
+        emulator.path, MOUNTING, reply_margin=0.02, silent_after=0.3, watchdog=0.5, patience=0.3
+    )
+    device = Dynamixel(settings)
+    try:
+        await device.start()
+        yield RealTimeRig(device, world)
+        await device.stop()
+        await device.stop()
+    finally:
+        await asyncio.to_thread(emulator.stop)
+
+
+async def test_tells_five_servos_at_rest(rig: Rig) -> None:
+    await rig.until(lambda: rig.device.latest() is not None)
+    state = rig.state()
+    assert state.position == pytest.approx(rig.true(), abs=2e-3)
+    assert state.velocity == pytest.approx((0.0,) * 5, abs=0.03)
+    assert state.voltage == pytest.approx((5.0,) * 5, abs=0.1)
+    assert all(15.0 < degrees < 60.0 for degrees in state.temperature)
+    assert state.error == (0, 0, 0, 0, 0)
+
+
+async def test_samples_go_on(rig: Rig) -> None:
+    await rig.until(lambda: rig.device.latest() is not None)
+    times: list[int] = []
+
+    def fifty() -> bool:
+        times.append(rig.state().t_ns)
+        return len(set(times)) == 50
+
+    await rig.until(fifty)
+    assert times == sorted(times)
+
+
+async def test_joints_and_tools_follow_position_goals(rig: Rig) -> None:
+    await rig.until(lambda: rig.device.latest() is not None)
+    start = rig.true()
+    go = rig.hold(0.1, 0.1, -0.2, 0.8, 0.5)
+    goals = go().position
+    await rig.until(lambda: rig.state().position == pytest.approx(goals, abs=0.03), go)
+    assert rig.true() == pytest.approx(goals, abs=0.03)
+    assert rig.state().torque_on
+    assert goals != pytest.approx(start, abs=0.05)
+
+
+async def test_a_moving_joint_shows_its_velocity_with_its_sign(rig: Rig) -> None:
+    await rig.until(lambda: rig.device.latest() is not None)
+    for move in (0.4, -0.4):
+        go = rig.hold(0.0, 0.0, 0.0, move, -move)
+        seen: list[tuple[float, float]] = []
+
+        def there(go: Callable[[], ServoCommand] = go, seen: list[tuple[float, float]] = seen) -> bool:
+            seen.append(rig.state().velocity[3:])
+            return rig.state().position == pytest.approx(go().position, abs=0.03)
+
+        await rig.until(there, go)
+        assert max(move * pump for pump, _ in seen) > 0.1
+        assert max(-move * gripper for _, gripper in seen) > 0.1
+
+
+async def test_torque_turns_the_tool_both_ways_and_shows_as_current(rig: Rig) -> None:
+    """The joint of the tool, the others held by what their weight needs of them being little: torque wins."""
+    await rig.until(lambda: rig.device.latest() is not None)
+    for sign in (1.0, -1.0):
+        await turns_the_tool(rig, sign)
+
+
+async def turns_the_tool(rig: Rig, sign: float) -> None:
+    before = rig.true()[2]
+    command = ServoCommand(JointMode.TORQUE, (0.0, 0.0, 0.3 * sign), rig.true(), 1.5)
+    await rig.until(lambda: sign * (rig.true()[2] - before) > 0.05, lambda: command)
+    await rig.until(lambda: sign * rig.state().current[2] > 0.1, lambda: command)
+
+
+async def test_pump_and_gripper_keep_their_places_while_the_joints_give_torque(rig: Rig) -> None:
+    await rig.until(lambda: rig.device.latest() is not None)
+    a, b, c, d, e = rig.true()
+    command = ServoCommand(JointMode.TORQUE, STILL, (a, b, c, d + 0.5, e + 0.3), 1.5)
+    await rig.until(lambda: rig.state().position[3:] == pytest.approx((d + 0.5, e + 0.3), abs=0.03), lambda: command)
+
+
+async def test_off_takes_the_torque_and_position_gives_it_back(rig: Rig) -> None:
+    await rig.until(lambda: rig.device.latest() is not None)
+    await rig.until(lambda: rig.state().torque_on, rig.hold())
+    off = ServoCommand(JointMode.OFF, STILL, rig.true(), 1.5)
+    await rig.until(lambda: not rig.state().torque_on, lambda: off)
+    await rig.until(lambda: rig.world.truth().joint_torque == pytest.approx(STILL, abs=1e-6), lambda: off)
+    await rig.until(lambda: rig.state().torque_on, rig.hold())
+
+
+async def test_the_current_limit_holds_the_joints_back(rig: Rig) -> None:
+    """With 50 mA the arm cannot be lifted."""
+    await rig.until(lambda: rig.device.latest() is not None)
+    await rig.until(lambda: rig.state().torque_on, rig.hold())
+    a, b, c, d, e = rig.true()
+    weak = ServoCommand(JointMode.POSITION, STILL, (a + 0.6, b, c, d, e), 0.05)
+    t = rig.world.time
+    await rig.until(lambda: rig.world.time > t + 0.5, lambda: weak)
+    assert abs(rig.world.truth().joint_torque[0]) < 0.05 * 0.93 / 1.8 + 1e-6
+    assert rig.true()[0] < a + 0.5
+
+
+async def test_what_is_not_finite_changes_nothing(rig: Rig) -> None:
+    await rig.until(lambda: rig.device.latest() is not None)
+    await rig.until(lambda: rig.state().torque_on, rig.hold())
+    before = rig.true()
+    broken = ServoCommand(JointMode.POSITION, STILL, (float("nan"), 0.0, 0.0, 0.0, 0.0), 1.5)
+    for _ in range(20):
+        rig.device.command(broken)
+        await rig.tick()
+    assert rig.true() == pytest.approx(before, abs=0.05)
