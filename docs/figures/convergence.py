@@ -20,15 +20,16 @@ DEFAULT, HALF = 100, 50
 MISSIONS = {
     "paper": "Scenario `paper`: ideal motors and servos\n",
     "desk": "Scenario `desk`: motor lag, gear friction, attitude interface\n\n"
-    "The differences of some micrometres do not shrink with the step: they are no error of integration.\n",
+    "The slide of the tip differs by 2 um, or 4 %. It does not shrink with the step: no error of integration.\n",
 }
 HEAD = """\
 <!-- Written by docs/figures/convergence.py; do not edit. -->
 # Convergence of the world
 
-One mission flown with four physics steps. Halving the default step of {default} us must change no figure of the table
-by more than {relative:.0%}; `tests/acceptance/test_convergence.py` holds it to that. A change counts as none where it
-is below the floor of its unit: {floors}. The loop runs at 250 Hz in all of them.
+Missions flown with four physics steps. In the scenario `paper`, halving the default step of {default} us must
+change no figure by more than {relative:.0%}; `tests/acceptance/test_convergence.py` holds it to that.
+A change counts as none where it is below the floor of its unit: {floors}.
+The loop runs at 250 Hz in all of them.
 """
 
 
