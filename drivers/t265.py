@@ -22,7 +22,7 @@ from drivers.frames import attitude_from_tracker, from_tracker
 from drivers.mailbox import Level, Mailbox, MailboxCounts, Notice, Notices
 from drivers.protocols import DeviceError
 from drivers.samples import Odometry
-from drivers.tracking import CameraPose, Coordinate, Jump, JumpLimits, Mount, Tracking, Unusable
+from drivers.tracking import CameraPose, Coordinate, Jump, JumpLimits, Mount, Tracking, UnusableError
 
 T = TypeVar("T")
 
@@ -225,7 +225,7 @@ class T265:
                 return
             try:
                 self._take(frame, now)
-            except Unusable as why:
+            except UnusableError as why:
                 self._reject(now, str(why))
             except Exception as error:  # librealsense's thread must not see it
                 self._reject(now, f"{type(error).__name__}: {error}")
@@ -333,9 +333,8 @@ class T265:
     def _check(self, now: int) -> None:
         drift = self._device_clock.drift()
         if abs(drift) > self._settings.drift:
-            self._drifts.happened(
-                now, f"its clock is {'slow' if drift > 0.0 else 'fast'} by {abs(drift) * 1e6:.0f} ppm"
-            )
+            way = "slow" if drift > 0.0 else "fast"
+            self._drifts.happened(now, f"its clock is {way} by {abs(drift) * 1e6:.0f} ppm")
         for trouble in (self._unusable, self._jumps, self._drifts):
             trouble.check(now)
 
@@ -400,8 +399,8 @@ def _camera(serial: str) -> Any:
             return device
     seen = ", ".join(f"{name} {number}" for name, number, _ in found) or "nothing"
     raise DeviceError(
-        f"tracker: no T265{f' {serial}' if serial else ''} found (seen: {seen}); unplug it and plug it in again (USB 3), "
-        "and use librealsense 2.53.1, the last one that knows it"
+        f"tracker: no T265{f' {serial}' if serial else ''} found (seen: {seen}); unplug it and plug it in again, "
+        "use USB 3, and librealsense 2.53.1, the last one that knows it"
     )
 
 
@@ -463,6 +462,6 @@ def _in_thread(work: Callable[[], T]) -> asyncio.Future[T]:
     return future
 
 
-async def _done(work: asyncio.Future[Any], timeout: float) -> bool:
+async def _done(work: asyncio.Future[Any], within: float) -> bool:
     """It has ended within the time, well or not."""
-    return bool((await asyncio.wait({work}, timeout=timeout))[0])
+    return bool((await asyncio.wait({work}, timeout=within))[0])

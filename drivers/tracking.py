@@ -68,7 +68,7 @@ class Jump(Struct, frozen=True, gc=False):
     """rad."""
 
 
-class Unusable(ValueError):
+class UnusableError(ValueError):
     """A pose that cannot be used; the text says why."""
 
 
@@ -95,12 +95,12 @@ class Tracking:
             self._resets += 1
 
     def take(self, pose: CameraPose) -> tuple[Odometry, Jump | None]:
-        """Odometry of the body, and the jump if this pose is one. Raises Unusable."""
+        """Odometry of the body, and the jump if this pose is one. Raises UnusableError."""
         size = hypot(*pose.q_VC)
         if not isfinite(sum(pose.p_VC) + sum(pose.v_VC) + sum(pose.w_VC) + size):
-            raise Unusable("it is not finite")
+            raise UnusableError("it is not finite")
         if not 0.9 < size < 1.1:
-            raise Unusable(f"its quaternion has length {size:.2f}")
+            raise UnusableError(f"its quaternion has length {size:.2f}")
         w, x, y, z = pose.q_VC
         q_VB = multiply((w / size, x / size, y / size, z / size), self._q_CB)
         ax, ay, az = rotate(q_VB, self._p_BC)
