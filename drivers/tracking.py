@@ -6,7 +6,7 @@ begins, level, wherever the camera is when it starts, so it is laid into W at th
 
 from __future__ import annotations
 
-from math import acos, dist, hypot, isfinite, pi, radians
+from math import acos, dist, hypot, isfinite, radians
 from typing import Annotated
 
 from msgspec import Meta, Struct
@@ -44,6 +44,7 @@ class JumpLimits(Struct, frozen=True, forbid_unknown_fields=True):
     position: Annotated[float, _meta("m", "from the mean velocity's way", 0.005, 1.0)] = 0.05
     angle_deg: Annotated[float, _meta("deg", "beyond the turn of the angular rate", 0.5, 90.0)] = 5.0
     acceleration: Annotated[float, _meta("m/s^2", "of which the vehicle is capable", 1.0, 100.0)] = 20.0
+    turning: Annotated[float, _meta("rad/s^2", "angular acceleration of which it is capable", 1.0, 1000.0)] = 50.0
 
 
 class CameraPose(Struct, frozen=True, gc=False):
@@ -144,6 +145,5 @@ class Tracking:
         angle = 2.0 * acos(min(1.0, abs(sum(c * d for c, d in zip(last.q_WB, q, strict=True)))))
         limits = self._limits
         far = position > limits.position + 0.5 * limits.acceleration * dt * dt
-        # within pi / 2 beyond the rates' turn: after a long gap nothing can be said
-        turned = angle > min(pi, radians(limits.angle_deg) + 2.0 * max(rate, self._last_rate) * dt)
+        turned = angle > radians(limits.angle_deg) + max(rate, self._last_rate) * dt + 0.5 * limits.turning * dt * dt
         return Jump(position, angle) if far or turned else None

@@ -245,7 +245,7 @@ def _software_device(rs: Any) -> tuple[Any, Any, Any]:
 # -- alone, from the command line ---------------------------------------------------------------------------------
 
 
-def _circle(world: World) -> AutopilotCommand:
+def circle(world: World) -> AutopilotCommand:
     """Take off, then a circle of 0.5 m in 8 s at 1 m height, nose along the way."""
     truth, vehicle = world.truth(), world.vehicle
     mass = vehicle.base.mass + vehicle.arm.sleeve.mass + sum(part.mass for part in vehicle.arm.parts)
@@ -265,7 +265,7 @@ async def _fly(world: World, emulator: T265Emulator, driver: T265, duration: flo
     starting = loop.create_task(driver.start())
     due = loop.time()
     while world.time < duration:
-        autopilot.command(_circle(world))
+        autopilot.command(circle(world))
         world.advance(PERIOD)
         emulator.step()
         for notice in driver.notices():
