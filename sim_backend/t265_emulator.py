@@ -92,6 +92,11 @@ class T265Emulator:
             raise DeviceError("tracker: no T265 found (seen: nothing); unplug it and plug it in again")
         return self._device
 
+    @property
+    def streaming(self) -> bool:
+        """Somebody has opened the stream of poses."""
+        return bool(self._sensor.get_active_streams())
+
     def start(self) -> None:
         """Step on the wall clock, in a thread of its own."""
         self._stopping.clear()
@@ -141,7 +146,7 @@ class T265Emulator:
 
     def _look_at_stream(self, t: float) -> None:
         """A stream that was opened begins a new V; one whose camera went away is dead until it is opened again."""
-        is_open = bool(self._sensor.get_active_streams())
+        is_open = self.streaming
         if is_open and not self._open:
             self._origin, self._moved, self._dead = None, 0.0, False
             self._waiting.clear()
