@@ -255,7 +255,7 @@ class T265:
     def _reopen(self) -> None:
         self._streams += 1
         self._close()
-        self._device_clock = DeviceClock()
+        # The map of the clock stays: if the new stream is late from its first pose on, only the old one can tell.
         self._tracking.restart()
         self._open()
 

@@ -148,7 +148,7 @@ class T265Emulator:
         """A stream that was opened begins a new V; one whose camera went away is dead until it is opened again."""
         is_open = self.streaming
         if is_open and not self._open:
-            self._origin, self._moved, self._dead = None, 0.0, False
+            self._origin, self._moved, self._dead, self._seen = None, 0.0, False, None
             self._waiting.clear()
         self._open = is_open
         self._dead = self._dead or self._gone(t)

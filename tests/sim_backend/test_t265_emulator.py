@@ -145,6 +145,17 @@ def test_the_worlds_noise_and_delay_are_the_cameras(vehicle: Vehicle) -> None:
     watch.close()
 
 
+def test_a_measurement_from_before_the_stream_is_its_first(vehicle: Vehicle) -> None:
+    world = World(vehicle)
+    watch = Watch(world, T265Emulator(world))
+    watch.emulator.step()
+    watch.open()
+    watch.emulator.step()
+    watch.emulator.step()
+    assert len(watch.frames) == 1
+    watch.close()
+
+
 def test_opened_again_it_begins_anew(watch: Watch) -> None:
     inject(watch, Kind.JUMP, value=2.0)
     assert watch.run(0.1)[-1].translation.z == pytest.approx(-2.0, abs=1e-3)
