@@ -2,7 +2,7 @@
 
 librealsense calls back in a thread of its own (a software device: in the thread that feeds it); there the pose becomes
 odometry of the body and is stored. All that may block (finding, opening, closing) runs in a thread that is given up
-when it hangs: closing a T265 is known to. (docs/decisions/0010-t265.md)
+when it hangs: closing a T265 is known to. (docs/decisions/0011-t265.md)
 """
 
 from __future__ import annotations
