@@ -202,7 +202,7 @@ _SLOW_STREAMS = (
     ("HEARTBEAT", 0, 10.0),
     ("SYS_STATUS", 1, 2.0),
     ("LOCAL_POSITION_NED", 32, 50.0),
-    ("TIMESYNC", 111, 10.0),
+    ("TIMESYNC", 111, 50.0),  # PX4 wants 500 answers before it believes our clock
     ("BATTERY_STATUS", 147, 2.0),
     ("EXTENDED_SYS_STATE", 245, 10.0),
 )

@@ -167,9 +167,10 @@ class T265:
         if not await _done(opening, timeout):
             raise DeviceError(f"tracker: opening it has hung for {timeout:g} s; unplug it and plug it in again")
         opening.result()
-        end = self._clock() + round(timeout * 1e9)
+        loop = asyncio.get_running_loop()
+        end = loop.time() + timeout
         while self._poses.counts(0).received == before:
-            if self._clock() > end:
+            if loop.time() > end:
                 rejected = self._poses.counts(0).rejected
                 raise DeviceError(
                     f"tracker: no usable pose within {timeout:g} s ({rejected} unusable ones); let it see light and "

@@ -91,6 +91,7 @@ _HELD = {"COM_OF_LOSS_T": "offboard_timeout", "COM_DISARM_LAND": "disarm_delay",
 _FIXED: Mapping[str, float | int] = {
     "COM_OBL_RC_ACT": 4,  # land
     "EKF2_EV_CTRL": 15,
+    "EKF2_EV_QMIN": 1,
     "EKF2_GPS_CTRL": 0,
     "EKF2_HGT_REF": 3,
     "MAV_SYS_ID": _SYSTEM,
@@ -444,8 +445,9 @@ class Px4StandIn:
             self._peer_clock = ((m.ts1 + now) // 2 - m.tc1, trip)
 
     def _on_odometry(self, m: Any) -> None:
-        """As PX4: other frames are ignored, a failed pose is not fused, and without a common time it is of now."""
-        if (m.frame_id, m.child_frame_id) != (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD) or m.quality < 0:
+        """As PX4: other frames and less than EKF2_EV_QMIN are ignored, and without a common time it is of now."""
+        known = (m.frame_id, m.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
+        if not known or m.quality < self._parameters["EKF2_EV_QMIN"]:
             return
         q_WB = attitude_from_px4((m.q[0], m.q[1], m.q[2], m.q[3]))
         now = self.world.snapshot.t_ns

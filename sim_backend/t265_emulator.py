@@ -34,7 +34,7 @@ from drivers.tracking import CameraPose, Mount
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.faults import Fault, Faults, Kind, read_fault_file, read_faults
-from sim_backend.mock_devices import MockAutopilot
+from sim_backend.mock_devices import Clock, MockAutopilot
 from sim_backend.world import World
 
 DEVICE = "odometry"
@@ -59,12 +59,22 @@ _INFO = {
 class T265Emulator:
     """The emulated camera on a vehicle of ``world``. Raises DeviceError where pyrealsense2 is absent.
 
+    The camera's clock is the world's, passed through ``clock`` as with the mock devices: where the world is moved in
+    real time by a thread that may fall behind, it must not look as if the camera's clock did.
     JUMP and DRIFT (m, m/s) lead along the camera's view at the start of its stream. After UNPLUGGED and REBOOT nothing
     comes until the stream is opened again.
     """
 
-    def __init__(self, world: World, mount: Mount | None = None, faults: Sequence[Fault] = (), seed: int = 0) -> None:
+    def __init__(
+        self,
+        world: World,
+        mount: Mount | None = None,
+        faults: Sequence[Fault] = (),
+        seed: int = 0,
+        clock: Clock | None = None,
+    ) -> None:
         self.world = world
+        self._clock = clock
         self.faults = Faults(DEVICE, KINDS, faults)
         #: Frames that were sent so far.
         self.sent = 0
@@ -218,7 +228,7 @@ class T265Emulator:
         frame.data = data
         frame.profile = self._profile
         frame.domain = rs.timestamp_domain.hardware_clock
-        frame.timestamp = pose.t_ns * 1e-6
+        frame.timestamp = (pose.t_ns if self._clock is None else self._clock(pose.t_ns)) * 1e-6
         frame.frame_number = self.sent
         self._sensor.on_pose_frame(frame)
         self.sent += 1

@@ -126,6 +126,15 @@ def test_times_are_the_measurements(watch: Watch) -> None:
     assert times == pytest.approx([watch.world.time * 1e3 - 5.0 * k for k in reversed(range(20))])
 
 
+def test_times_go_through_the_clock_of_who_moves_the_world(vehicle: Vehicle) -> None:
+    world = World(vehicle)
+    watch = Watch(world, T265Emulator(world, clock=lambda t_ns: t_ns + 7_000_000_000))
+    watch.open()
+    watch.run(0.01)
+    assert [t for t, _ in watch.frames] == pytest.approx([7005.0, 7010.0])
+    watch.close()
+
+
 def test_nothing_is_sent_twice(watch: Watch) -> None:
     watch.run(0.05)
     watch.emulator.step()
