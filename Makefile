@@ -58,9 +58,9 @@ $(PY):
 	"$(PYTHON)" -m venv $(VENV)
 
 $(RUN): pyproject.toml constraints.txt | $(PY)
-	$(INSTALL) -e '.[sim,ground]'
+	$(INSTALL) -e '.[sim,ground,vision]'
 	@touch $@
 
 $(DEV): $(RUN)
-	$(INSTALL) -e '.[sim,ground,dev]'
+	$(INSTALL) -e '.[sim,ground,vision,dev]'
 	@touch $@

@@ -3,6 +3,10 @@
 PX4 tells vectors of the world in NED (x north, y east, z down), vectors of the body in FRD (x forward, y right,
 z down), and the attitude as the quaternion that takes FRD to NED. W is ENU and B is FLU. Each of the three
 conversions is its own inverse; both directions have a name so that a call reads as what it does.
+
+The T265 tells poses with x right, y up, z backwards, both for its own body and for its world, whose y axis it levels
+against gravity. V is that world with x forward, y left, z up, and C is the camera with x along its view, y left, z up.
+How V lies in W, and C in B, is no matter of axes (``drivers/tracking.py``).
 """
 
 from __future__ import annotations
@@ -47,3 +51,25 @@ def attitude_from_px4(q: Quat) -> Quat:
 def px4_from_attitude(q_WB: Quat) -> Quat:
     """The quaternion (w, x, y, z) that takes FRD to NED, of ``q_WB``."""
     return attitude_from_px4(q_WB)
+
+
+def from_tracker(v: Vec3) -> Vec3:
+    """A vector given in the T265's axes (world or body), in V or C."""
+    return (-v[2], -v[0], v[1])
+
+
+def tracker_from(v: Vec3) -> Vec3:
+    """A vector given in V or C, in the T265's axes."""
+    return (-v[1], v[2], -v[0])
+
+
+def attitude_from_tracker(q: Quat) -> Quat:
+    """``q_VC`` of the T265's quaternion (w, x, y, z), which takes its body to its world: the axis changes its name."""
+    w, x, y, z = q
+    return (w, -z, -x, y)
+
+
+def tracker_from_attitude(q_VC: Quat) -> Quat:
+    """The T265's quaternion (w, x, y, z), of ``q_VC``."""
+    w, x, y, z = q_VC
+    return (w, -y, z, -x)

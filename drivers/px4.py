@@ -21,10 +21,28 @@ import msgspec
 from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
 from msgspec import Meta, Struct
 
-from drivers.frames import attitude_from_px4, body_from_px4, px4_from_attitude, px4_from_body, world_from_px4
+from drivers.frames import (
+    attitude_from_px4,
+    body_from_px4,
+    px4_from_attitude,
+    px4_from_body,
+    px4_from_world,
+    world_from_px4,
+)
 from drivers.mailbox import Level, Mailbox, MailboxCounts, Notice, Notices
 from drivers.protocols import DeviceError
-from drivers.samples import AutopilotCommand, AutopilotState, Engage, FlightMode, Interface, Landed, Quat, Vec3
+from drivers.rotation import inverse, rotate
+from drivers.samples import (
+    AutopilotCommand,
+    AutopilotState,
+    Engage,
+    FlightMode,
+    Interface,
+    Landed,
+    Odometry,
+    Quat,
+    Vec3,
+)
 from drivers.thrust import ThrustMap
 
 
@@ -41,6 +59,7 @@ class Px4Settings(Struct, frozen=True, forbid_unknown_fields=True):
     rate: Annotated[float, _meta("Hz", "asked for attitude and IMU", 10.0, 1000.0)] = 250.0
     stream_time: Annotated[float, _meta("s", "set-points run this long before offboard is asked for", 0.2, 10.0)] = 1.0
     stream_gap: Annotated[float, _meta("s", "a longer pause starts stream_time again", 0.02, 0.5)] = 0.1
+    vision_rate: Annotated[float, _meta("Hz", "at most so many poses are handed on to PX4", 1.0, 250.0)] = 40.0
 
 
 class Motion(Struct, frozen=True, gc=False):
@@ -106,6 +125,11 @@ class _StatusText(Struct, gc=False):
     chunk_seq: int = 0
 
 
+class _Timesync(Struct, gc=False):
+    tc1: int
+    ts1: int
+
+
 class _CommandAck(Struct, gc=False):
     result: int
 
@@ -158,6 +182,7 @@ _UNUSED_CELL = 65535
 _TEXT_CHUNK = 50
 _MAX_CHUNKED_TEXTS = 16
 _IGNORE_BODY_RATES, _IGNORE_ATTITUDE = 7, 128  # ATTITUDE_TARGET_TYPEMASK
+_LOCAL_FRD, _BODY_FRD, _VIO = 20, 12, 3  # MAV_FRAME, MAV_FRAME, MAV_ESTIMATOR_TYPE
 
 _ACCEPTED = 0
 _RESULTS = {1: "temporarily rejected", 2: "denied", 3: "unsupported", 4: "failed", 6: "cancelled"}  # MAV_RESULT
@@ -177,6 +202,7 @@ _SLOW_STREAMS = (
     ("HEARTBEAT", 0, 10.0),
     ("SYS_STATUS", 1, 2.0),
     ("LOCAL_POSITION_NED", 32, 50.0),
+    ("TIMESYNC", 111, 50.0),  # PX4 wants 500 answers before it believes our clock
     ("BATTERY_STATUS", 147, 2.0),
     ("EXTENDED_SYS_STATE", 245, 10.0),
 )
@@ -238,6 +264,8 @@ class Px4:
         self._asked: dict[_Ask, int] = {}
         self._refusals: set[str] = set()
         self._sent = 0
+        self._vision_due_ns = 0
+        self._vision_sent = 0
 
     # -- life cycle -----------------------------------------------------------------------------------------------
 
@@ -301,6 +329,7 @@ class Px4:
         self._subscribe("BATTERY_STATUS", _BatteryStatus, self._on_battery)
         self._subscribe("SYS_STATUS", _SysStatus, self._on_health)
         self._subscribe("STATUSTEXT", _StatusText, self._on_text)
+        self._subscribe("TIMESYNC", _Timesync, self._on_timesync)
         await self._ask_intervals()
         await self._wait_for_samples()
         self._rates_checked_ns = self._clock()
@@ -376,6 +405,39 @@ class Px4:
             self._commanded_ns = now
             self._send_set_point(command, now)
 
+    def odometry(self, sample: Odometry, position: float, attitude: float, velocity: float, quality: int) -> None:
+        """Hand a pose to PX4's estimator, with the variances of position (m^2), attitude (rad^2), velocity (m^2/s^2).
+
+        ``quality`` is MAVLink's: 1 to 100 %, -1 failed. Call it with the newest sample at every tick; no sample is sent
+        twice, and no more of them than ``vision_rate``. One with a number that is not finite is not sent, and told.
+        Raises DeviceError before ``start`` and after ``stop``.
+        """
+        if self._direct is None:
+            raise DeviceError("autopilot: odometry() before start() or after stop()")
+        period = round(1e9 / self._settings.vision_rate)
+        # A time that lies far before the last one is of a clock that was set, and not of an old sample.
+        if self._vision_due_ns - 2 * period < sample.t_ns < self._vision_due_ns:
+            return
+        # From the last due time, not from now, so that the mean rate is the asked one.
+        behind = sample.t_ns - self._vision_due_ns
+        self._vision_due_ns = self._vision_due_ns + period if 0 <= behind < period else sample.t_ns + period
+        # W's axes are east, north, up, as everywhere on this link; PX4 takes the heading from here, so that north of
+        # its own estimate is +y of W too.
+        p, q = px4_from_world(sample.p_WB), px4_from_attitude(sample.q_WB)
+        v = px4_from_body(rotate(inverse(sample.q_WB), sample.v_WB))
+        if not isfinite(sum(p) + sum(q) + sum(v) + position + attitude + velocity):
+            self._refuse("a pose that is not finite was not sent")
+            return
+        self._send(
+            "ODOMETRY",
+            f'{{"time_usec":{sample.t_ns // 1000},"frame_id":{_LOCAL_FRD},"child_frame_id":{_BODY_FRD},'
+            f'"x":{p[0]},"y":{p[1]},"z":{p[2]},"q":[{q[0]},{q[1]},{q[2]},{q[3]}],'
+            f'"vx":{v[0]},"vy":{v[1]},"vz":{v[2]},"rollspeed":null,"pitchspeed":null,"yawspeed":null,'
+            f'"pose_covariance":{_covariance(position, attitude)},"velocity_covariance":{_covariance(velocity, None)},'
+            f'"reset_counter":{sample.reset_counter & 0xFF},"estimator_type":{_VIO},"quality":{quality}}}',
+        )
+        self._vision_sent += 1
+
     def motion(self) -> Motion | None:
         """PX4's own position and velocity, or None before the first."""
         return self._motion.latest()
@@ -396,6 +458,10 @@ class Px4:
     def sent(self) -> int:
         """Set-points sent so far."""
         return self._sent
+
+    def vision_sent(self) -> int:
+        """Poses handed on to PX4 so far."""
+        return self._vision_sent
 
     # -- set-points -----------------------------------------------------------------------------------------------
 
@@ -418,8 +484,11 @@ class Px4:
         self._sent += 1
 
     def _send(self, name: str, fields: str) -> None:
+        direct = self._direct
+        if direct is None:  # stopped meanwhile
+            return
         try:
-            self._direct.send_message(MavlinkMessage(message_name=name, fields_json=fields))
+            direct.send_message(MavlinkMessage(message_name=name, fields_json=fields))
         except MavlinkDirectError as error:
             self._refuse(f"{name} was not sent: {error.result.name}")
 
@@ -588,6 +657,14 @@ class Px4:
         level = Level.ERROR if m.severity <= 3 else Level.WARNING if m.severity == 4 else Level.INFO  # MAV_SEVERITY
         self._told.tell(now, level, f"PX4: {text}")
 
+    def _on_timesync(self, m: _Timesync, now: int) -> None:
+        # PX4 asks for the time here, and so learns to read the times of the poses.
+        if m.tc1 == 0:
+            self._send(
+                "TIMESYNC",
+                f'{{"tc1":{now},"ts1":{m.ts1},"target_system":{_SYSTEM},"target_component":{_AUTOPILOT}}}',
+            )
+
     def _on_link(self, connected: bool, _: object) -> None:
         if connected == self._linked:
             return
@@ -614,6 +691,12 @@ class Px4:
 def _hush() -> None:
     """Keep MAVSDK from printing, once for the process; what matters of it is told in notices."""
     mavsdk.log_subscribe(lambda level, text, file, line: True)
+
+
+def _covariance(linear: float, angular: float | None) -> str:
+    """The upper right triangle, row by row, of a diagonal 6x6 matrix; None is not known (NaN on the wire)."""
+    a, b = f"{linear}", "null" if angular is None else f"{angular}"
+    return f"[{a},0,0,0,0,0,{a},0,0,0,0,{a},0,0,0,{b},0,0,{b},0,{b}]"
 
 
 def _command_json(ask: _Ask) -> str:

@@ -21,9 +21,17 @@ from typing import Any
 import msgspec
 from pymavlink.dialects.v20 import common as mavlink
 
-from drivers.frames import attitude_from_px4, body_from_px4, px4_from_attitude, px4_from_body, px4_from_world
+from drivers.frames import (
+    attitude_from_px4,
+    body_from_px4,
+    px4_from_attitude,
+    px4_from_body,
+    px4_from_world,
+    world_from_px4,
+)
 from drivers.protocols import DeviceError
-from drivers.samples import FlightMode, Interface, Landed
+from drivers.rotation import rotate
+from drivers.samples import FlightMode, Interface, Landed, Odometry
 from drivers.thrust import motor_signal, thrust_fraction
 from sim_backend import layout as at
 from sim_backend.autopilot import SetPoint
@@ -53,6 +61,7 @@ DEFAULT_RATES: Mapping[int, float] = {
     mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 0.5,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 1.0,
     mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
+    mavlink.MAVLINK_MSG_ID_TIMESYNC: 10.0,
 }
 
 _SENSORS = (
@@ -82,6 +91,7 @@ _HELD = {"COM_OF_LOSS_T": "offboard_timeout", "COM_DISARM_LAND": "disarm_delay",
 _FIXED: Mapping[str, float | int] = {
     "COM_OBL_RC_ACT": 4,  # land
     "EKF2_EV_CTRL": 15,
+    "EKF2_EV_QMIN": 1,
     "EKF2_GPS_CTRL": 0,
     "EKF2_HGT_REF": 3,
     "MAV_SYS_ID": _SYSTEM,
@@ -135,6 +145,10 @@ class Px4StandIn:
         self._out: list[bytes] = []
         self._mav = mavlink.MAVLink(None, srcSystem=_SYSTEM, srcComponent=_AUTOPILOT)
         self._parsers: dict[Address, Any] = {}
+        #: Newest pose that PX4 would fuse, in the world's axes and at the world's time.
+        self.vision: Odometry | None = None
+        #: World time less the time of the peer that tells poses, ns, and the round trip that it was measured on.
+        self._peer_clock: tuple[int, int] | None = None
         self._intervals = {number: 1.0 / rate for number, rate in DEFAULT_RATES.items()}
         self._due = dict.fromkeys(self._intervals, 0.0)
         self._text_id = 0
@@ -148,6 +162,7 @@ class Px4StandIn:
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: self._autopilot_version,
+            mavlink.MAVLINK_MSG_ID_TIMESYNC: self._timesync,
         }
         self._handlers: dict[str, Callable[[Any], None]] = {
             "SET_ATTITUDE_TARGET": self._on_set_attitude_target,
@@ -158,6 +173,7 @@ class Px4StandIn:
             "PARAM_SET": self._on_param_set,
             "TIMESYNC": self._on_timesync,
             "PING": self._on_ping,
+            "ODOMETRY": self._on_odometry,
         }
         self._socket = socket(AF_INET, SOCK_DGRAM)
         try:
@@ -420,8 +436,29 @@ class Px4StandIn:
         self._send(mavlink.MAVLink_param_value_message(name.encode(), wire, kind, len(self._parameters), index))
 
     def _on_timesync(self, m: Any) -> None:
+        now = self.world.snapshot.t_ns
         if m.tc1 == 0:
-            self._send(mavlink.MAVLink_timesync_message(self.world.snapshot.t_ns, m.ts1))
+            self._send(mavlink.MAVLink_timesync_message(now, m.ts1))
+            return
+        trip = now - m.ts1
+        if trip >= 0 and (self._peer_clock is None or trip <= self._peer_clock[1]):
+            self._peer_clock = ((m.ts1 + now) // 2 - m.tc1, trip)
+
+    def _on_odometry(self, m: Any) -> None:
+        """As PX4: other frames and less than EKF2_EV_QMIN are ignored, and without a common time it is of now."""
+        known = (m.frame_id, m.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
+        if not known or m.quality < self._parameters["EKF2_EV_QMIN"]:
+            return
+        q_WB = attitude_from_px4((m.q[0], m.q[1], m.q[2], m.q[3]))
+        now = self.world.snapshot.t_ns
+        self.vision = Odometry(
+            t_ns=now if self._peer_clock is None else m.time_usec * 1000 + self._peer_clock[0],
+            p_WB=world_from_px4((m.x, m.y, m.z)),
+            q_WB=q_WB,
+            v_WB=rotate(q_WB, body_from_px4((m.vx, m.vy, m.vz))),
+            confidence=round(3 * m.quality / 100),
+            reset_counter=m.reset_counter,
+        )
 
     def _on_ping(self, m: Any) -> None:
         if m.target_system == 0:
@@ -471,6 +508,9 @@ class Px4StandIn:
         return mavlink.MAVLink_heartbeat_message(
             mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, base, main << 16 | sub << 24, status, 3
         )
+
+    def _timesync(self) -> Any:
+        return mavlink.MAVLink_timesync_message(0, self.world.snapshot.t_ns)
 
     def _sys_status(self) -> Any:
         voltage, remaining = self._millivolts(), self._percent()

@@ -88,11 +88,44 @@ def test_roll_right_keeps_its_sign() -> None:
     assert rotate(q, (0.0, 0.0, 1.0))[1] == pytest.approx(-sin(radians(15.0)))
 
 
+def test_tracker_axes() -> None:
+    """The T265 has x right, y up, z backwards."""
+    assert frames.from_tracker((1.0, 0.0, 0.0)) == (0.0, -1.0, 0.0)  # right is -y
+    assert frames.from_tracker((0.0, 1.0, 0.0)) == (0.0, 0.0, 1.0)  # up is +z
+    assert frames.from_tracker((0.0, 0.0, -1.0)) == (1.0, 0.0, 0.0)  # forward is +x
+    assert frames.tracker_from((1.0, 2.0, 3.0)) == (-2.0, 3.0, -1.0)
+
+
+def test_tracker_level() -> None:
+    assert frames.attitude_from_tracker((1.0, 0.0, 0.0, 0.0)) == (1.0, 0.0, 0.0, 0.0)
+
+
+def test_tracker_turned_left() -> None:
+    """A turn to the left is one about up: the T265's y, our z."""
+    q = frames.attitude_from_tracker(about((0.0, 1.0, 0.0), 0.5 * pi))
+    assert q == pytest.approx(about((0.0, 0.0, 1.0), 0.5 * pi))
+    assert rotate(q, (1.0, 0.0, 0.0)) == pytest.approx((0.0, 1.0, 0.0))
+
+
+def test_tracker_nose_down() -> None:
+    """Looking down is a turn about the T265's right by -30 degrees, and +30 degrees of pitch: thrust gains +x."""
+    q = frames.attitude_from_tracker(about((1.0, 0.0, 0.0), radians(-30.0)))
+    assert q == pytest.approx(about((0.0, 1.0, 0.0), radians(30.0)))
+    assert rotate(q, (0.0, 0.0, 1.0))[0] == pytest.approx(0.5)
+
+
+def test_tracker_right_side_down() -> None:
+    """Right side down is a turn about forward, the T265's -z: positive roll here."""
+    q = frames.attitude_from_tracker(about((0.0, 0.0, -1.0), radians(15.0)))
+    assert q == pytest.approx(about((1.0, 0.0, 0.0), radians(15.0)))
+
+
 @settings(deadline=None, max_examples=50, derandomize=True)
 @given(v=vector)
 def test_vectors_round_trip(v: Vec3) -> None:
     assert frames.px4_from_world(frames.world_from_px4(v)) == v
     assert frames.px4_from_body(frames.body_from_px4(v)) == v
+    assert frames.tracker_from(frames.from_tracker(v)) == v
 
 
 @settings(deadline=None, max_examples=100, derandomize=True)
@@ -104,3 +137,13 @@ def test_attitude_round_trips_and_agrees_with_the_vectors(q: Quat, v: Vec3) -> N
     q_WB = frames.attitude_from_px4(q)
     assert frames.px4_from_attitude(q_WB) == pytest.approx(q, abs=1e-12)
     assert rotate(q_WB, frames.body_from_px4(v)) == pytest.approx(frames.world_from_px4(rotate(q, v)), abs=1e-9)
+
+
+@settings(deadline=None, max_examples=100, derandomize=True)
+@given(q=st.tuples(number, number, number, number).filter(lambda q: sum(c * c for c in q) > 1e-3), v=vector)
+def test_the_trackers_attitude_round_trips_and_agrees_with_its_vectors(q: Quat, v: Vec3) -> None:
+    n = sqrt(sum(c * c for c in q))
+    q = (q[0] / n, q[1] / n, q[2] / n, q[3] / n)
+    q_VC = frames.attitude_from_tracker(q)
+    assert frames.tracker_from_attitude(q_VC) == q
+    assert rotate(q_VC, frames.from_tracker(v)) == pytest.approx(frames.from_tracker(rotate(q, v)), abs=1e-9)

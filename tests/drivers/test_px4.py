@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import struct
+import time
 from collections.abc import AsyncIterator, Callable
-from math import inf, nan
+from math import inf, isnan, nan
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
 
@@ -17,7 +18,7 @@ import yaml
 from drivers.mailbox import Level
 from drivers.protocols import DeviceError
 from drivers.px4 import Px4, Px4Settings
-from drivers.samples import AutopilotCommand, Engage, FlightMode, Interface, Quat, Vec3
+from drivers.samples import AutopilotCommand, Engage, FlightMode, Interface, Odometry, Quat, Vec3
 from drivers.thrust import ThrustMap
 from drivers.vehicle import Vehicle
 from sim_backend.px4_emulator import Px4StandIn
@@ -152,6 +153,105 @@ async def test_the_bytes_of_a_body_rate_set_point(pair: tuple[Px4, Px4StandIn]) 
     assert (roll, pitch, yaw) == pytest.approx((0.1, -0.2, -0.3), abs=1e-6)
     assert thrust == pytest.approx(0.5, abs=1e-6)
     assert (system, component, mask) == (1, 1, 0b1000_0000)
+
+
+POSE = Odometry(
+    t_ns=1_234_567_890_123_456,
+    p_WB=(1.0, 2.0, 3.0),
+    q_WB=(0.5**0.5, 0.0, 0.0, 0.5**0.5),
+    v_WB=(0.4, 0.5, 0.6),
+    confidence=3,
+    reset_counter=258,
+)
+
+
+async def test_the_bytes_of_a_pose(pair: tuple[Px4, Px4StandIn]) -> None:
+    """Facing +y (north): x on the wire is W's y, y its x, z down; the body sees its velocity ahead, right, down."""
+    px4, stand_in = pair
+    px4.odometry(POSE, 1e-3, 2e-3, 3e-3, 66)
+    await until(lambda: "ODOMETRY" in stand_in.newest)
+    raw = bytes(stand_in.newest["ODOMETRY"].get_msgbuf())
+    assert raw[0] == 0xFD
+    assert (raw[5], raw[6]) == (1, 191)
+    assert int.from_bytes(raw[7:10], "little") == 331
+    assert len(raw) == 10 + 233 + 2
+    payload = raw[10:-2]
+    microseconds, *floats = struct.unpack("<Q55f", payload[:228])
+    frame, child, reset, estimator, quality = struct.unpack("<4Bb", payload[228:])
+    assert microseconds == 1_234_567_890_123  # us, of the clock that TIMESYNC tells
+    assert floats[0:3] == pytest.approx([2.0, 1.0, -3.0])
+    assert floats[3:7] == pytest.approx([1.0, 0.0, 0.0, 0.0], abs=1e-6)
+    assert floats[7:10] == pytest.approx([0.5, 0.4, -0.6])
+    assert all(isnan(value) for value in floats[10:13])  # angular velocity: not told
+    nought = 0.0
+    assert floats[13:34] == pytest.approx(
+        [1e-3, *[nought] * 5, 1e-3, *[nought] * 4, 1e-3, *[nought] * 3, 2e-3, nought, nought, 2e-3, nought, 2e-3]
+    )
+    assert floats[34:55] == pytest.approx(
+        [3e-3, *[nought] * 5, 3e-3, *[nought] * 4, 3e-3, *[nought] * 3, nan, nought, nought, nan, nought, nan],
+        nan_ok=True,
+    )
+    assert (frame, child, estimator) == (20, 12, 3)  # MAV_FRAME_LOCAL_FRD, MAV_FRAME_BODY_FRD, MAV_ESTIMATOR_TYPE_VIO
+    assert (reset, quality) == (2, 66)  # the counter goes round at 256
+
+
+async def test_a_pose_arrives_as_it_was_sent(pair: tuple[Px4, Px4StandIn]) -> None:
+    """At the far end, in W again, and at the time of the far end's clock, give or take the steps of its thread."""
+    px4, stand_in = pair
+    await until(lambda: stand_in.received["TIMESYNC"] > 10)
+    now = time.monotonic_ns()
+    there = stand_in.world.snapshot.t_ns
+    px4.odometry(msgspec.structs.replace(POSE, t_ns=now - 100_000_000, q_WB=(0.5, 0.5, 0.5, 0.5)), 1e-3, 1e-3, 1e-3, 66)
+    await until(lambda: stand_in.vision is not None)
+    seen = stand_in.vision
+    assert seen is not None
+    assert seen.t_ns == pytest.approx(there - 100_000_000, abs=20_000_000)
+    assert seen.p_WB == pytest.approx((1.0, 2.0, 3.0))
+    assert seen.q_WB == pytest.approx((0.5, 0.5, 0.5, 0.5))
+    assert seen.v_WB == pytest.approx((0.4, 0.5, 0.6))
+    assert (seen.confidence, seen.reset_counter) == (2, 2)
+
+
+async def test_a_failed_pose_is_told_as_failed(pair: tuple[Px4, Px4StandIn]) -> None:
+    px4, stand_in = pair
+    px4.odometry(POSE, 1.0, 1.0, 1.0, -1)
+    await until(lambda: "ODOMETRY" in stand_in.newest)
+    assert stand_in.newest["ODOMETRY"].quality == -1
+    assert stand_in.vision is None
+
+
+async def test_poses_are_thinned_out_and_never_repeated(pair: tuple[Px4, Px4StandIn]) -> None:
+    """Of 2 s at 200 Hz, each offered at two ticks, 40 Hz are sent; of one that grows old, nothing more."""
+    px4, stand_in = pair
+    for k in range(400):
+        sample = msgspec.structs.replace(POSE, t_ns=POSE.t_ns + 5_000_000 * k)
+        for _ in range(2):
+            px4.odometry(sample, 1e-3, 1e-3, 1e-3, 100)
+    assert px4.vision_sent() == 80
+    for _ in range(100):
+        px4.odometry(sample, 1e-3, 1e-3, 1e-3, 100)
+    assert px4.vision_sent() == 80
+    # a tracker whose clock was set back goes on
+    px4.odometry(msgspec.structs.replace(POSE, t_ns=5), 1e-3, 1e-3, 1e-3, 100)
+    assert px4.vision_sent() == 81
+    await until(lambda: stand_in.received["ODOMETRY"] == 81)
+
+
+async def test_a_pose_that_is_not_finite_is_not_sent(pair: tuple[Px4, Px4StandIn]) -> None:
+    px4, stand_in = pair
+    for k in range(10):
+        px4.odometry(
+            msgspec.structs.replace(POSE, t_ns=POSE.t_ns + 10**9 * k, v_WB=(nan, 0.0, 0.0)), 1e-3, 1e-3, 1e-3, 100
+        )
+    px4.odometry(msgspec.structs.replace(POSE, t_ns=POSE.t_ns + 10**11), 1e-3, 1e-3, 1e-3, 100)
+    await until(lambda: stand_in.received["ODOMETRY"] > 0)
+    assert stand_in.received["ODOMETRY"] == px4.vision_sent() == 1
+    assert sum("a pose that is not finite was not sent" in n.text for n in px4.notices()) == 1
+
+
+async def test_poses_outside_of_start_and_stop() -> None:
+    with pytest.raises(DeviceError, match=r"odometry\(\) before start"):
+        Px4(settings("udpin://127.0.0.1:0")).odometry(POSE, 1e-3, 1e-3, 1e-3, 100)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,144 @@
+"""What every tracker owes, whatever is behind it: one suite, run on each face.
+
+``mock`` answers in process. ``t265`` is the real driver over an emulated camera that sits askew on the vehicle, on a
+software device of librealsense. Both run in simulated time, on a vehicle that flies a circle.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+import pytest_asyncio
+import yaml
+
+from drivers.protocols import OdometryDevice
+from drivers.samples import Odometry
+from drivers.t265 import T265, T265Settings
+from drivers.tracking import Mount
+from drivers.vehicle import Vehicle
+from sim_backend.mock_devices import MockAutopilot, MockOdometry
+from sim_backend.t265_emulator import PERIOD, T265Emulator, circle
+from sim_backend.world import World
+
+pytestmark = pytest.mark.asyncio
+
+VEHICLE = msgspec.convert(
+    yaml.safe_load((Path(__file__).parents[2] / "configs" / "vehicle.yaml").read_text(encoding="utf-8")), Vehicle
+)
+MOUNT = Mount(offset=(0.12, -0.03, 0.05), rotation_deg=(10.0, 40.0, -25.0))
+
+
+class Rig:
+    """One device on one world."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.device: OdometryDevice = MockOdometry(world)
+
+    def tick(self) -> None:
+        self.world.advance(PERIOD)
+
+    async def start(self) -> None:
+        starting = asyncio.create_task(self.device.start())
+        while not starting.done():
+            self.tick()
+            await asyncio.sleep(0.0)
+        await starting
+
+    def sample(self) -> Odometry:
+        sample = self.device.latest()
+        assert sample is not None
+        return sample
+
+    def fly(self, duration: float, each: Callable[[], None] = lambda: None) -> None:
+        autopilot = MockAutopilot(self.world)
+        end = self.world.time + duration
+        while self.world.time < end:
+            autopilot.command(circle(self.world))
+            self.tick()
+            each()
+
+
+class T265Rig(Rig):
+    def __init__(self, world: World) -> None:
+        super().__init__(world)
+        self.emulator = T265Emulator(world, MOUNT)
+        settings = T265Settings(start=world.truth().p_WB, mount=MOUNT)
+        self.device = T265(settings, self.emulator.find, lambda: world.snapshot.t_ns)
+
+    def tick(self) -> None:
+        super().tick()
+        self.emulator.step()
+
+
+@pytest_asyncio.fixture(params=["mock", "t265"])
+async def rig(request: pytest.FixtureRequest) -> AsyncIterator[Rig]:
+    world = World(VEHICLE)
+    if request.param == "t265":
+        pytest.importorskip("pyrealsense2", reason="pyrealsense2 cannot be imported here", exc_type=ImportError)
+        rig: Rig = T265Rig(world)
+    else:
+        rig = Rig(world)
+    await rig.start()
+    yield rig
+    await rig.device.stop()
+
+
+async def test_tells_where_the_vehicle_stands(rig: Rig) -> None:
+    rig.tick()
+    sample, truth = rig.sample(), rig.world.truth()
+    assert sample.p_WB == pytest.approx(truth.p_WB, abs=1e-5)
+    assert sample.q_WB == pytest.approx(truth.q_WB, abs=1e-5)
+    assert sample.v_WB == pytest.approx((0.0, 0.0, 0.0), abs=1e-5)
+    assert (sample.confidence, sample.reset_counter) == (3, 0)
+
+
+async def test_follows_a_flight(rig: Rig) -> None:
+    """Up and half a circle round, pitching, rolling, turning: pose and velocity of the body origin at every sample."""
+
+    def compare() -> None:
+        sample, truth = rig.sample(), rig.world.truth()
+        assert sample.p_WB == pytest.approx(truth.p_WB, abs=1e-5)
+        assert sample.v_WB == pytest.approx(truth.v_WB, abs=1e-5)
+        assert abs(sum(a * b for a, b in zip(sample.q_WB, truth.q_WB, strict=True))) == pytest.approx(1.0, abs=1e-9)
+        assert sample.reset_counter == 0
+
+    rig.fly(8.0, compare)
+    assert rig.sample().p_WB[1] > 0.8
+    assert rig.sample().p_WB[2] > 0.9
+
+
+async def test_samples_are_fresh_and_in_order(rig: Rig) -> None:
+    times: list[int] = []
+
+    def note() -> None:
+        times.append(rig.sample().t_ns)
+        assert 0 <= rig.world.snapshot.t_ns - times[-1] < 10_000_000
+
+    rig.fly(1.0, note)
+    assert len(set(times)) == len(times) == 200
+    assert times == sorted(times)
+
+
+async def test_reading_takes_nothing_away(rig: Rig) -> None:
+    assert rig.sample() == rig.sample()
+
+
+async def test_stop_twice_and_start_again(rig: Rig) -> None:
+    await rig.device.stop()
+    await rig.device.stop()
+    await rig.start()
+    rig.tick()
+    before = rig.sample()
+    rig.tick()
+    assert rig.sample().t_ns > before.t_ns
+
+
+async def test_stop_before_start() -> None:
+    world = World(VEHICLE)
+    await MockOdometry(world).stop()
+    await T265(T265Settings(start=world.truth().p_WB)).stop()
