@@ -176,13 +176,20 @@ def _onboard(arguments: list[str]) -> int:
 
     It has a process group of its own and every interrupt is passed on to it once, so that it can end in order.
     """
-    child = subprocess.Popen([sys.executable, "-P", "-m", "onboard", *arguments], process_group=0)
+    child: subprocess.Popen[bytes] | None = None
+    early: list[int] = []
 
     def pass_on(number: int, frame: FrameType | None) -> None:
-        child.send_signal(number)
+        if child is None:
+            early.append(number)
+        else:
+            child.send_signal(number)
 
     former = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
+        child = subprocess.Popen([sys.executable, "-P", "-m", "onboard", *arguments], process_group=0)
+        for number in early:
+            child.send_signal(number)
         code = child.wait()
     finally:
         for number, handler in former.items():

@@ -223,11 +223,11 @@ def test_real_flight_process_refuses_wrong_input(
 def test_interrupts_reach_the_flight_process_once(monkeypatch: pytest.MonkeyPatch) -> None:
     script = (
         "import signal, sys\n"
-        "count = []\n"
-        "signal.signal(signal.SIGINT, lambda *_: count.append(1))\n"
+        # blocked, an interrupt waits for the one who asks for it, whenever it comes
+        "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})\n"
         "print('ready', flush=True)\n"
-        "signal.pause()\n"
-        "sys.exit(40 + len(count))\n"
+        "signal.sigwait({signal.SIGINT})\n"
+        "sys.exit(41 + len(signal.sigpending()))\n"
     )
     real = subprocess.Popen
     read_end, write_end = os.pipe()
