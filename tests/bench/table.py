@@ -65,7 +65,7 @@ def _flight(report: Report) -> list[str]:
         _line(
             f"world, a tick of {f.steps_per_tick} steps",
             f.world,
-            share(f.world_s) + f"{f.steps_per_s:,.0f} steps/s, {f.speed:.0f} x real time",
+            share(f.world_s) + f"{f.steps_per_s / 1e6:.2f} M steps/s, {f.speed:.0f} x real time",
         )
     )
     lines.append(
