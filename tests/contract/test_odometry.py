@@ -56,8 +56,7 @@ class Rig:
 
     def fly(self, duration: float, each: Callable[[], None] = lambda: None) -> None:
         autopilot = MockAutopilot(self.world)
-        end = self.world.time + duration
-        while self.world.time < end:
+        for _ in range(round(duration / PERIOD)):
             autopilot.command(circle(self.world))
             self.tick()
             each()
