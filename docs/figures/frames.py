@@ -5,7 +5,7 @@ Run from the repository's root: python -m docs.figures.frames
 
 from __future__ import annotations
 
-from math import cos, degrees, hypot, sin
+from math import cos, degrees, sin
 from pathlib import Path
 
 import matplotlib
@@ -82,7 +82,7 @@ def draw_frames(axes: Axes, arm: Arm) -> None:
     line(axes, tail, elbow, color=LINK, lw=5)
     line(axes, mount, elbow, color=LINK, lw=5)
     line(axes, elbow, wrist, color=LINK, lw=5)
-    for tool, text, place in ((Tool.GRIPPER, "gripper", (26, -12)), (Tool.NEEDLE, "needle", (-2, 12))):
+    for tool, text, place in ((Tool.GRIPPER, "gripper", (-8, -16)), (Tool.NEEDLE, "needle", (-2, 12))):
         x, _, z = tips[tool]
         line(axes, wrist, (x, z), color=LINK, lw=4 if tool is Tool.GRIPPER else 1.5)
         axes.annotate(text, (x, z), xytext=place, textcoords="offset points", fontsize=9, ha="center", va="center")
@@ -91,19 +91,19 @@ def draw_frames(axes: Axes, arm: Arm) -> None:
     axis(axes, (0.0, 0.0), 0.0, "$x_B$", 0.13)
     axis(axes, (0.0, 0.0), np.pi / 2, "$z_B$", 0.11)
     axis(axes, mount, 0.0, "$x_M$", 0.16)
-    axis(axes, mount, np.pi / 2, "$y_M$", 0.045)
+    axis(axes, mount, np.pi / 2, "$y_M$", 0.055)
     angle_mark(axes, mount, one, r"$\theta_1$", 0.07)
     angle_mark(axes, elbow, two, r"$\theta_2$", 0.08)
-    angle_mark(axes, wrist, three, r"$\theta_3$", 0.135, 1.12)
+    angle_mark(axes, wrist, three, r"$\theta_3$", 0.15, 1.12)
     # E: z_E = -u(theta_3), x_E = u(theta_3 + pi/2) (eq. 17).
     gripper = (tips[Tool.GRIPPER][0], tips[Tool.GRIPPER][2])
     axis(axes, gripper, three + np.pi / 2, "$x_E$", 0.05)
+    axis(axes, gripper, three + np.pi, "", 0.05)
     axes.annotate(
-        "$z_E$ points back along the gripper", gripper, xytext=(-30, -42), textcoords="offset points",
-        color=FRAME, fontsize=8, ha="center",
+        "$z_E$", polar(gripper, 0.04, three + np.pi), xytext=(-8, -8), textcoords="offset points",
+        color=FRAME, fontsize=9, ha="center", va="center",
     )  # fmt: skip
-    line(axes, gripper, polar(gripper, 0.05, three + np.pi), color=FRAME, lw=1.6, zorder=6)
-    axes.set(xlim=(-0.2, 0.52), ylim=(-0.36, 0.16), title="Frames, joint angles and tools, seen from the right")
+    axes.set(xlim=(-0.2, 0.52), ylim=(-0.31, 0.16), title="Frames, joint angles and tools, seen from the right")
 
 
 def draw_workspace(axes: Axes, arm: Arm) -> None:
@@ -122,10 +122,9 @@ def draw_workspace(axes: Axes, arm: Arm) -> None:
     )
     axes.plot(*target, "x", color=FRAME)
     axes.annotate(
-        f"a target beyond reach,\nclamped by {1e3 * by:.0f} mm", target, xytext=(6, -18), textcoords="offset points",
+        f"a target beyond reach,\nclamped by {1e3 * by:.0f} mm", target, xytext=(0, -28), textcoords="offset points",
         fontsize=8, color=FRAME, ha="center",
     )  # fmt: skip
-    assert hypot(target[0] - near_x, target[1] - near_z) <= by + 1e-12
     axes.legend(loc="upper left", fontsize=8, frameon=False)
     axes.set(xlim=(-0.47, 0.47), ylim=(-0.47, 0.47), title="Workspace of the wrist, in M")
 
