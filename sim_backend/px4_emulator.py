@@ -1,9 +1,9 @@
 """A stand-in for PX4: our world behind MAVLink 2 on UDP.
 
 ``Px4StandIn`` is a face of ``world.autopilot``: it speaks what MAVSDK and pymavlink need to connect and stay content,
-and refuses what PX4 refuses, with PX4's words. One ``step`` takes what has arrived, advances the world by one period
-and publishes what is due. ``start`` paces steps on the wall clock in a thread of its own; a test may call ``step``
-instead. Mock devices of the same world may stand beside it, with its ``clock``.
+and refuses what PX4 refuses, with PX4's words. ``receive`` takes what has arrived; once the world has been advanced by
+``period``, ``publish`` sends what is due. ``start`` paces both on the wall clock in a thread of its own; a test may
+call ``step`` instead. Mock devices of the same world may stand beside it, with its ``clock``.
 """
 
 from __future__ import annotations
@@ -227,8 +227,12 @@ class Px4StandIn:
 
     def step(self) -> None:
         """Take what has arrived, advance the world by one period, publish what is due."""
-        self._receive()
+        self.receive()
         self.world.advance(self.period)
+        self.publish()
+
+    def publish(self) -> None:
+        """Look at the world as it now stands: tell what has changed, send what is due."""
         self._state = self._face.latest()
         self._tell_changes()
         t = self.world.time
@@ -241,7 +245,8 @@ class Px4StandIn:
 
     # -- the wire -------------------------------------------------------------------------------------------------
 
-    def _receive(self) -> None:
+    def receive(self) -> None:
+        """Take the datagrams that have arrived, and do what they say."""
         while True:
             try:
                 data, address = self._socket.recvfrom(2048)
