@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from drivers.mailbox import Notice
 from drivers.samples import AutopilotCommand, AutopilotState, Odometry, ServoCommand, ServoState
 
 
@@ -15,6 +16,9 @@ class Device(Protocol):
 
     async def stop(self) -> None:
         """Release the device; safe to call twice, and after a failed start."""
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Sentences for a person since the last call, oldest first."""
 
 
 class AutopilotDevice(Device, Protocol):

@@ -53,8 +53,12 @@ def _meta(unit: str, doc: str, low: float, high: float) -> Meta:
 class Px4Settings(Struct, frozen=True, forbid_unknown_fields=True):
     """Where PX4 is and what is asked of it."""
 
-    thrust: ThrustMap
-    url: Annotated[str, Meta(description="MAVSDK URL: serial:///dev/ttyTHS1:921600, udpin://0.0.0.0:14540, ...")]
+    url: Annotated[
+        str,
+        Meta(description="MAVSDK URL: serial:///dev/ttyTHS1:921600, udpin://0.0.0.0:14540, ...; empty: the emulator's"),
+    ] = ""
+    thrust: ThrustMap | None = None
+    """From newtons to set-points, as identified; None: what the vehicle's data imply."""
     timeout: Annotated[float, _meta("s", "for each stage of connecting", 0.1, 300.0)] = 10.0
     rate: Annotated[float, _meta("Hz", "asked for attitude and IMU", 10.0, 1000.0)] = 250.0
     stream_time: Annotated[float, _meta("s", "set-points run this long before offboard is asked for", 0.2, 10.0)] = 1.0
@@ -222,7 +226,11 @@ class Px4:
     """
 
     def __init__(self, settings: Px4Settings, clock: Callable[[], int] = monotonic_ns) -> None:
+        """Raises DeviceError for settings without a thrust map."""
+        if settings.thrust is None:
+            raise DeviceError("autopilot: no thrust map (thrust); identify one in a hover, or take ThrustMap.of(vehicle)")
         self._settings = settings
+        self._thrust = settings.thrust
         self._clock = clock
         self._told = Notices()
         fast = settings.rate
@@ -467,7 +475,7 @@ class Px4:
 
     def _send_set_point(self, command: AutopilotCommand, now: int) -> None:
         battery = self._battery.latest()
-        thrust = self._settings.thrust.set_point(command.thrust, battery.voltage if battery else nan)
+        thrust = self._thrust.set_point(command.thrust, battery.voltage if battery else nan)
         if command.interface is Interface.ATTITUDE:
             mask, q, w = _IGNORE_BODY_RATES, px4_from_attitude(command.q_WB), (0.0, 0.0, 0.0)
         else:

@@ -64,8 +64,8 @@ class Variances(Struct, frozen=True, forbid_unknown_fields=True):
 class T265Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where the camera sits, where it begins, and what is asked of it."""
 
-    start: tuple[Coordinate, Coordinate, Coordinate]
-    """p_WB at the first pose: on the ground, (0, 0, gear height)."""
+    start: tuple[Coordinate, Coordinate, Coordinate] | None = None
+    """p_WB at the first pose; None: standing on the ground at the origin, as the vehicle's data imply."""
     start_heading_deg: Annotated[float, _meta("deg", "yaw of the body in W at the first pose", -180.0, 180.0)] = 0.0
     mount: Mount = Mount()
     jump: JumpLimits = JumpLimits()
@@ -139,7 +139,8 @@ class T265:
 
     def _begin(self) -> None:
         settings = self._settings
-        self._tracking = Tracking(settings.mount, settings.jump, settings.start, radians(settings.start_heading_deg))
+        start = settings.start or (0.0, 0.0, 0.0)
+        self._tracking = Tracking(settings.mount, settings.jump, start, radians(settings.start_heading_deg))
         self._device_clock = DeviceClock()
         self._unusable = _Trouble(self._tell, "its poses are usable again; {count} were not")
         self._jumps = _Trouble(self._tell, "no more jumps; there were {count}")

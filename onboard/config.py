@@ -7,7 +7,7 @@ Later layers win: ``vehicle.yaml`` (as ``vehicle``), ``controllers/<law>.yaml``,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -15,11 +15,14 @@ from typing import Annotated, Any, TypeVar
 from msgspec import Meta
 
 from onboard.core.params import Params
+from onboard.device_config import DeviceConfig
 from onboard.layers import ConfigError, Layer, parse_set, read_yaml
 from onboard.params import compose, dump_yaml
+from sim_backend.faults import Fault
 from sim_backend.world import WorldParams
 
 #: Beside the packages, in the source tree as well as when installed.
+VEHICLE = "vehicle.yaml"
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
 T = TypeVar("T")
@@ -36,6 +39,9 @@ class Config(Params, frozen=True, kw_only=True):
     law: Annotated[str, _run("name of the controller parameter set")] = "tuned"
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1), _run("seed of everything random in the world")] = 0
     world: WorldParams = WorldParams()
+    faults: tuple[Fault, ...] = ()
+    """What goes wrong with emulated devices."""
+    devices: DeviceConfig = DeviceConfig()
 
 
 def load_config(
@@ -47,7 +53,7 @@ def load_config(
 ) -> Config:
     """Compose and check the configuration of a run.
 
-    ``scenario`` is a name in ``configs/scenarios`` or a path to a file; the ``config.yaml`` of a former run is taken
+    ``scenario`` is the name of a file in ``configs`` or ``configs/scenarios``, or a path to one; the ``config.yaml`` of a former run is taken
     as it stands. ``law`` names a file in ``configs/controllers``; else the scenario says which, else ``tuned``.
     Raises ConfigError with every error, each naming its file and line or its option.
     """
@@ -99,26 +105,33 @@ def dump_config(config: Config) -> str:
 
 def scenario_names(directory: Path = CONFIGS) -> list[str]:
     """Names of the scenarios that exist."""
-    return _names(directory / "scenarios")
+    return sorted(_scenarios(directory))
 
 
 def law_names(directory: Path = CONFIGS) -> list[str]:
     """Names of the controller parameter sets that exist."""
-    return _names(directory / "controllers")
+    return list(_named_files(directory / "controllers"))
 
 
-def _names(folder: Path) -> list[str]:
-    return sorted(path.stem for path in folder.glob("*.yaml"))
+def _named_files(folder: Path) -> dict[str, Path]:
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def _scenarios(directory: Path) -> dict[str, Path]:
+    """Where to fly and what to do, and in ``configs`` itself also with which devices."""
+    whole = {name: path for name, path in _named_files(directory).items() if path.name != VEHICLE}
+    return {**whole, **_named_files(directory / "scenarios")}
 
 
 def _scenario(scenario: str, directory: Path) -> Layer:
     if "/" in scenario or "\\" in scenario or scenario.endswith((".yaml", ".yml")):
         return read_yaml(Path(scenario))
-    return _named("scenario", scenario, f"--scenario {scenario}", directory / "scenarios")
+    return _named("scenario", scenario, f"--scenario {scenario}", _scenarios(directory), directory / "scenarios")
 
 
 def _controller(law: Any, origin: str, directory: Path) -> Layer:
-    return _named("law", law, origin, directory / "controllers")
+    folder = directory / "controllers"
+    return _named("law", law, origin, _named_files(folder), folder)
 
 
 def _gains(key: str, layers: Sequence[Layer | None], folder: Path) -> Layer | None:
@@ -129,7 +142,7 @@ def _gains(key: str, layers: Sequence[Layer | None], folder: Path) -> Layer | No
 
 
 def _vehicle(directory: Path) -> Layer:
-    path = directory / "vehicle.yaml"
+    path = directory / VEHICLE
     if not path.is_file():
         raise ConfigError([f"{path}: not found; run from the source tree, or install the package with its configs"])
     return read_yaml(path, _shown(path)).under("vehicle")
@@ -143,14 +156,12 @@ def _option(text: str) -> Layer:
     return layer
 
 
-def _named(kind: str, name: Any, origin: str, folder: Path) -> Layer:
-    names = _names(folder)
-    if name not in names:
-        names.sort(key=lambda known: -SequenceMatcher(None, str(name), known).ratio())
+def _named(kind: str, name: Any, origin: str, files: Mapping[str, Path], folder: Path) -> Layer:
+    if name not in files:
+        names = sorted(files, key=lambda known: -SequenceMatcher(None, str(name), known).ratio())
         known = f"there are: {', '.join(names)}" if names else f"there is none in {_shown(folder)}"
         raise ConfigError([f"{origin}: no {kind} of the name {str(name)!r}; {known}"])
-    path = folder / f"{name}.yaml"
-    return read_yaml(path, _shown(path))
+    return read_yaml(files[name], _shown(files[name]))
 
 
 def _shown(path: Path) -> str:

@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Callable
 from math import radians
+from typing import Any
 
+from msgspec.structs import replace
+
+from drivers.dynamixel import Dynamixel
 from drivers.mailbox import Notice
-from drivers.protocols import AutopilotDevice, OdometryDevice, ServoDevice
-from drivers.px4 import Px4, Px4Settings
+from drivers.protocols import AutopilotDevice, Device, DeviceError, OdometryDevice, ServoDevice
+from drivers.px4 import Px4
+from drivers.samples import Interface
+from drivers.t265 import T265
 from drivers.thrust import ThrustMap
 from onboard.config import Config
+from onboard.device_config import Kind
+from onboard.layers import ConfigError
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
-from sim_backend.px4_emulator import Px4StandIn
+from sim_backend.software_camera import SoftwareCamera
 from sim_backend.world import World
+from sim_backend.world_client import LinkedAutopilot, LinkedOdometry, LinkedServos, WorldClient
+from sim_backend.world_messages import Camera, Look
+
+#: For the world to answer, s: it compiles before it moves for the first time on a machine.
+_WORLD_PATIENCE = 120.0
+_TELL_PERIOD = 0.1
 
 
 class DeviceSet:
@@ -21,6 +37,13 @@ class DeviceSet:
         self.autopilot = autopilot
         self.odometry = odometry
         self.servos = servos
+
+    def relay(self) -> None:
+        """What one device must hear of another, once a tick: nothing."""
+
+    def obstacles(self) -> tuple[str, ...]:
+        """Why the vehicle must not arm: nothing speaks against it."""
+        return ()
 
 
 def world_of(config: Config) -> World:
@@ -35,32 +58,159 @@ def mock_devices(world: World) -> DeviceSet:
     return DeviceSet(MockAutopilot(world), MockOdometry(world), MockServos(world))
 
 
-class DeskDevices(DeviceSet):
-    """The real PX4 driver over UDP on loopback to a stand-in that moves the world on the wall clock; the rest mock."""
+def check_devices(config: Config) -> None:
+    """Raises ConfigError with everything about the devices that cannot be flown."""
+    devices, errors = config.devices, []
+    kinds = devices.kinds()
+    if kinds["autopilot"] is not Kind.MOCK and config.interface is Interface.WRENCH:
+        errors.append("interface = wrench: no autopilot accepts a wrench; choose attitude or body_rate")
+    if kinds["autopilot"] is not Kind.MOCK and not devices.autopilot.url:
+        errors.append("devices.autopilot.url: missing; want for example serial:///dev/ttyTHS1:921600")
+    if kinds["servos"] is not Kind.MOCK and not devices.servos.port:
+        errors.append("devices.servos.port: missing; want for example /dev/servos")
+    unreal = [name for name, kind in kinds.items() if kind is not Kind.REAL]
+    if unreal and not devices.world:
+        errors.append(
+            f"devices.world: missing, and {' and '.join(unreal)} need a world; pipewright desk starts one, and "
+            "pipewright world tells its address"
+        )
+    if errors:
+        raise ConfigError(errors)
+
+
+class FlightDevices(DeviceSet):
+    """The devices that a configuration asks for, on the machine's monotonic clock.
+
+    ``on_look`` may be set to hear how the simulated world looks, if there is one, in a thread of its own.
+    """
+
+    on_look: Callable[[Look], None] | None = None
 
     def __init__(self, config: Config) -> None:
-        self.world = world_of(config)
-        self._stand_in = Px4StandIn(self.world)
-        url = f"udpout://127.0.0.1:{self._stand_in.port}"
-        self._px4 = Px4(Px4Settings(thrust=ThrustMap.of(config.vehicle), url=url))
-        clock = self._stand_in.clock
-        super().__init__(self._px4, MockOdometry(self.world, clock), MockServos(self.world, clock))
+        """Connects to nothing yet. Raises ConfigError for devices that cannot be flown."""
+        check_devices(config)
+        devices, kinds = config.devices, config.devices.kinds()
+        self._px4: Px4 | None = None
+        self._tracker: T265 | None = None
+        self._camera: SoftwareCamera | None = None
+        self.world: WorldClient | None = None
+        if any(kind is not Kind.REAL for kind in kinds.values()):
+            mocks = tuple(name for name, kind in kinds.items() if kind is Kind.MOCK)
+            self.world = WorldClient(devices.world, mocks, self._look, self._see, self._is_streaming)
+        super().__init__(self._autopilot_of(config), self._odometry_of(config), self._servos_of(config))
+        self._named: dict[str, Device] = {
+            "autopilot": self.autopilot, "odometry": self.odometry, "servos": self.servos
+        }  # fmt: skip
+        self._mixed = _mixed(kinds, devices.hitl)
 
-    async def start(self) -> None:
-        """Start the world and connect. Raises DeviceError."""
-        self._stand_in.start()
-        await self._px4.start()
+    def _autopilot_of(self, config: Config) -> AutopilotDevice:
+        settings = config.devices.autopilot
+        if settings.kind is Kind.MOCK:
+            assert self.world is not None
+            return LinkedAutopilot(self.world)
+        self._px4 = Px4(replace(settings, thrust=settings.thrust or ThrustMap.of(config.vehicle)))
+        return self._px4
+
+    def _odometry_of(self, config: Config) -> OdometryDevice:
+        settings = config.devices.odometry
+        if settings.kind is Kind.MOCK:
+            assert self.world is not None
+            return LinkedOdometry(self.world)
+        settings = replace(settings, start=settings.start or (0.0, 0.0, config.vehicle.base.gear_height))
+        find: Callable[[], Any] | None = None
+        if settings.kind is Kind.EMULATED:
+            self._camera = SoftwareCamera()
+            find = self._camera.find
+        self._tracker = T265(settings, find)
+        return self._tracker
+
+    def _servos_of(self, config: Config) -> ServoDevice:
+        settings = config.devices.servos
+        if settings.kind is Kind.MOCK:
+            assert self.world is not None
+            return LinkedServos(self.world)
+        return Dynamixel(settings)
+
+    # -- life cycle -----------------------------------------------------------------------------------------------
+
+    async def start(self, say: Callable[[str], None]) -> None:
+        """Connect to all at once; ``say`` hears what is waited for. Raises DeviceError with every reason."""
+        if self.world is not None:
+            await asyncio.to_thread(self.world.start, _WORLD_PATIENCE)
+        starts = {name: asyncio.create_task(device.start(), name=name) for name, device in self._named.items()}
+        pending = set(starts.values())
+        try:
+            while pending:
+                _, pending = await asyncio.wait(pending, timeout=_TELL_PERIOD)
+                for notice in self.notices():
+                    say(notice.text)
+        finally:
+            for task in pending:
+                task.cancel()
+        failures = [task.exception() for task in starts.values()]
+        if any(failures):
+            await self.stop()
+            for failure in failures:
+                if failure is not None and not isinstance(failure, DeviceError):
+                    raise failure
+            raise DeviceError("\n".join(str(failure) for failure in failures if failure is not None))
 
     async def stop(self) -> None:
-        """Disconnect, then stop the world."""
-        await self._px4.stop()
-        self._stand_in.stop()
+        """Release all, the world's link last."""
+        await asyncio.gather(*(device.stop() for device in self._named.values()))
+        if self.world is not None:
+            await asyncio.to_thread(self.world.stop)
+
+    # -- in every tick --------------------------------------------------------------------------------------------
+
+    def relay(self) -> None:
+        """Hand the newest pose to PX4's own estimator."""
+        if self._px4 is not None and self._tracker is not None:
+            pose = self._tracker.latest()
+            if pose is not None:
+                self._px4.odometry(pose, *self._tracker.trust(pose.confidence))
+
+    def obstacles(self) -> tuple[str, ...]:
+        """Why the vehicle must not arm."""
+        return self._mixed
 
     def notices(self) -> tuple[Notice, ...]:
-        """What the driver has had to tell since the last call."""
-        return self._px4.notices()
+        """What the drivers have had to tell since the last call."""
+        told = [notice for device in self._named.values() for notice in device.notices()]
+        return tuple(sorted(told, key=lambda notice: notice.t_ns))
+
+    def tell_phase(self, phase: str) -> None:
+        """The mission's phase, for faults that are declared for one."""
+        if self.world is not None:
+            self.world.tell_phase(phase)
 
     @property
-    def slipped(self) -> int:
-        """Periods that the world could not keep pace with the wall clock."""
-        return self._stand_in.slipped
+    def lost(self) -> str:
+        """What happened to the simulated vehicle; empty while it is whole, and for a real one."""
+        look = None if self.world is None else self.world.latest()
+        return "" if look is None else look.truth.crashed
+
+    # -- what the world's link calls, in its thread ---------------------------------------------------------------
+
+    def _look(self, look: Look) -> None:
+        if (hear := self.on_look) is not None:
+            hear(look)
+
+    def _is_streaming(self) -> bool:
+        return self._camera is not None and self._camera.streaming
+
+    def _see(self, camera: Camera) -> None:
+        device = self._camera
+        if device is not None:
+            device.gone = camera.gone
+            for pose in camera.poses:
+                device.tell(pose)
+
+
+def _mixed(kinds: dict[str, Kind], hitl: bool) -> tuple[str, ...]:
+    unreal = [f"{name} is {kind}" for name, kind in kinds.items() if kind is not Kind.REAL]
+    if hitl or not unreal or kinds["autopilot"] is not Kind.REAL:
+        return ()
+    return (f"the autopilot is real, but {' and '.join(unreal)}: only with devices.hitl, propellers off",)
+
+

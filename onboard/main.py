@@ -1,4 +1,4 @@
-"""``python -m onboard``: the flight process, started as a person or the ground station would.
+"""``python -m onboard``: the flight process, and what goes with it, as a person or the ground station starts them.
 
 Exit codes: 0 the run ended by itself and its log is complete, 2 wrong input, 5 a device cannot be had.
 """
@@ -8,12 +8,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from drivers.protocols import DeviceError
-from drivers.samples import Interface
 from onboard.config import Config, dump_config, load_config
 from onboard.core.plan import InfeasibleError
 from onboard.core.types import Outputs, Phase
@@ -28,7 +27,7 @@ CHAIN = (
 
 
 class Progress:
-    """A bar over the phases of the mission, with the phase, the simulated time and the speed."""
+    """A bar over the phases of the mission, with the phase, the time and the speed."""
 
     def __init__(self, shown: bool) -> None:
         self._bar: Any = None
@@ -52,7 +51,7 @@ class Progress:
                 self._bar.n = CHAIN.index(outputs.phase)
         elif self._count % 250:
             return
-        self._bar.set_postfix_str(f"{t:6.1f} s simulated")
+        self._bar.set_postfix_str(f"{t:6.1f} s flown")
 
     def close(self) -> None:
         """Take the bar away."""
@@ -62,9 +61,13 @@ class Progress:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
-    options = _parser().parse_args(arguments)
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or (given[0].startswith("-") and given[0] not in ("-h", "--help")):
+        given.insert(0, "fly")
+    options = _parser().parse_args(given)
     try:
-        return {"sim": _sim, "desk": _desk, "replay": _replay}[options.command](options)
+        run: Callable[[argparse.Namespace], int] = options.run
+        return run(options)
     except ConfigError as error:
         print(error, file=sys.stderr)
     except InfeasibleError as error:
@@ -79,19 +82,27 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m onboard", description=__doc__.split("\n")[0] if __doc__ else "")
     commands = parser.add_subparsers(dest="command", required=True)
     sim = commands.add_parser("sim", help="fly the mission in a simulated world, in virtual time")
-    desk = commands.add_parser("desk", help="fly the mission in real time, the autopilot behind MAVLink")
-    for command, scenario in ((sim, "paper"), (desk, "desk")):
-        command.add_argument("--scenario", default=scenario)
+    fly = commands.add_parser("fly", help="the flight process: the configured devices, on the wall clock (default)")
+    world = commands.add_parser("world", help="a simulated world with emulated devices, for a flight process to fly in")
+    for command, name, run in ((sim, "--scenario", _sim), (fly, "--config", _fly), (world, "--config", _world)):
+        default = {"default": "paper"} if command is sim else {"required": True}
+        command.add_argument(name, dest="scenario", metavar="NAME|FILE", **default)
         command.add_argument("--law")
         command.add_argument("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE")
         command.add_argument("--seed", type=int)
+        command.set_defaults(run=run)
+    for command in (sim, fly):
         command.add_argument("--out", type=Path, required=True, help="an existing or new run folder")
         command.add_argument("--no-progress", action="store_true")
-    desk.add_argument("--duration", type=float, default=600.0, metavar="SECONDS", help="then land")
+    fly.add_argument("--mission", action="store_true", help="fly the whole mission once preflight passes, then end")
+    fly.add_argument("--duration", type=float, metavar="SECONDS", help="then land")
+    fly.add_argument("--attended", action="store_true", help="end in order when standard input closes")
+    world.add_argument("--servo-link", type=Path, metavar="PATH", help="symbolic link to make to the servo bus")
     replay = commands.add_parser("replay", help="run a log's inputs through the core again and compare to the bit")
     replay.add_argument("log", type=Path)
     replay.add_argument("--from", type=float, dest="start", metavar="SECONDS")
     replay.add_argument("--partial", action="store_true")
+    replay.set_defaults(run=_replay)
     return parser
 
 
@@ -121,22 +132,29 @@ def _sim(options: argparse.Namespace) -> int:
     return 0
 
 
-def _desk(options: argparse.Namespace) -> int:
-    from onboard.desk import fly
+def _fly(options: argparse.Namespace) -> int:
+    from onboard.devices import check_devices
+    from onboard.fly import Options, fly
 
     config = load_config(options.scenario, options.law, options.sets, options.seed)
-    if config.interface is Interface.WRENCH:
-        raise ConfigError(["interface = wrench: no autopilot accepts a wrench; choose attitude or body_rate"])
+    check_devices(config)
     log = _prepare(config, options.out)
     progress = Progress(not options.no_progress and sys.stderr.isatty())
 
     def say(text: str) -> None:
-        print(text, file=sys.stderr)
+        print(text, file=sys.stderr, flush=True)
 
     try:
-        asyncio.run(fly(config, log, progress, say, options.duration))
+        asyncio.run(fly(config, log, Options(options.mission, options.duration, options.attended), progress, say))
     finally:
         progress.close()
+    return 0
+
+
+def _world(options: argparse.Namespace) -> int:
+    from onboard.world import serve
+
+    serve(load_config(options.scenario, options.law, options.sets, options.seed), options.servo_link)
     return 0
 
 

@@ -97,7 +97,7 @@ class Recorder:
         self._writer = McapWriter(self._stream, f"pipewright {info.version}")
         self._channels: dict[str, Channel] = {}
         self._ticks = self._writer.channel(TICK, Tick)
-        self._truths = self._writer.channel(TRUTH, Truth)
+        self._truths = self._channels[TRUTH] = self._writer.channel(TRUTH, Truth)
         self._queue: queue.Queue[Callable[[], None] | None] | None = None
         self._writer.metadata(INFO_NAME, {key: str(value) for key, value in msgspec.to_builtins(info).items()})
         self._writer.attachment(CONFIG_NAME, "application/yaml", config_yaml.encode())
@@ -130,6 +130,10 @@ class Recorder:
     def revision(self, index: int, t_ns: int, revision: int, config: Struct) -> None:
         """Record the parameter set that is in force from tick ``index`` on."""
         self._do(PARAMS, t_ns, Revision(index, t_ns, revision, config), Revision[type(config)])  # type: ignore[misc]
+
+    def truth(self, t_ns: int, truth: Truth) -> None:
+        """Record what was true in the world at a time of its own."""
+        self._do(TRUTH, t_ns, truth, Truth)
 
     def event(self, event: Event) -> None:
         """Record an event from outside the core."""

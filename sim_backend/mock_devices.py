@@ -30,6 +30,10 @@ class _Mock:
     async def stop(self) -> None:
         """Nothing to release."""
 
+    def notices(self) -> tuple[()]:
+        """Nothing to tell."""
+        return ()
+
 
 class MockAutopilot(_Mock):
     """The autopilot of the world; works towards the commanded ``Engage`` as the real driver does.
