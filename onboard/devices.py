@@ -22,6 +22,13 @@ class DeviceSet:
         self.odometry = odometry
         self.servos = servos
 
+    def relay(self) -> None:
+        """Nothing is handed from one device to another."""
+
+    def obstacles(self) -> tuple[str, ...]:
+        """Nothing forbids arming."""
+        return ()
+
 
 def world_of(config: Config) -> World:
     """The simulated world of a configuration."""
