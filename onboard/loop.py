@@ -18,11 +18,17 @@ KEYFRAME_PERIOD_NS = 1_000_000_000
 
 
 class Devices(Protocol):
-    """The three devices of the vehicle."""
+    """The three devices of the vehicle, and what concerns more than one of them. No call waits."""
 
     autopilot: AutopilotDevice
     odometry: OdometryDevice
     servos: ServoDevice
+
+    def relay(self) -> None:
+        """Hand on what one device tells another; called once a tick, after the commands are out."""
+
+    def obstacles(self) -> tuple[str, ...]:
+        """Sentences on why the vehicle must not arm; looked at once a tick."""
 
 
 class Sink(Protocol):
@@ -77,17 +83,21 @@ class Loop:
                 devices.autopilot.latest(),
                 devices.servos.latest(),
                 self._requests.popleft() if self._requests else None,
+                devices.obstacles(),
             )
             before = state
             state, outputs = step(state, inputs, params, inputs.dt)
             devices.autopilot.command(outputs.autopilot)
+            sent = clock.now_ns()
             devices.servos.command(outputs.servos)
+            devices.relay()
             if now >= keyframe_due:
                 sink.keyframe(index, now, before)
                 keyframe_due += KEYFRAME_PERIOD_NS
             sink.tick(Tick(index, self.revision, inputs, outputs))
             if self._timed:
-                sink.timing(Timing(index, now, (now - due) * 1e-9, (clock.now_ns() - now) * 1e-9))
+                late, busy = (now - due) * 1e-9, (clock.now_ns() - now) * 1e-9
+                sink.timing(Timing(index, now, late, busy, (sent - now) * 1e-9))
             self._state, self.outputs = state, outputs
             if not on_tick(outputs):
                 return

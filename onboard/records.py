@@ -66,7 +66,9 @@ class Timing(Struct, frozen=True, gc=False):
     late: float
     """Start of the tick against its schedule, s."""
     busy: float
-    """Time from the start of the tick to its last command, s."""
+    """Time from the start of the tick to its end, s."""
+    sent: float
+    """Time from the start of the tick until the autopilot's set-point had left, s."""
 
 
 class NonFinite(Struct, frozen=True):

@@ -62,6 +62,7 @@ def for_safety(
             age_servos=0.0 if servos is None else believed.age_servos,
             dt=inputs.dt,
             inputs_finite=seen.finite,
+            obstacles=" ".join(inputs.obstacles),
             missing=", ".join(
                 name for name, told in zip(_DEVICES, (odometry, autopilot, servos), strict=True) if told is None
             ),
@@ -98,6 +99,7 @@ def for_safety(
         seen.finite,
         engaged_before and autopilot.mode is not FlightMode.OFFBOARD,
         seen.disagreement,
+        obstacles=" ".join(inputs.obstacles),
     )
 
 

@@ -154,6 +154,8 @@ class Facts(Struct, frozen=True, gc=False):
     """Angle between the verticals of odometry and autopilot, rad."""
     missing: str = ""
     """Names of the devices that have not told anything yet; their ages count as 0."""
+    obstacles: str = ""
+    """Sentences on why the vehicle must not arm, from outside the core."""
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
@@ -199,6 +201,7 @@ class Condition(NamedTuple):
 
 
 WARNS: Final = Actions(Action.WARN, Action.WARN, Action.WARN)
+WARNS_GROUNDED: Final = Actions(Action.WARN, Action.NONE, Action.NONE)
 HOLDS: Final = Actions(Action.WARN, Action.HOLD, Action.RETREAT)
 BACKS_OFF: Final = Actions(Action.WARN, Action.RETREAT, Action.RETREAT)
 LANDS: Final = Actions(Action.WARN, Action.LAND, Action.LAND)
@@ -242,6 +245,8 @@ TABLE: Final[tuple[Condition, ...]] = (
     Condition("non_finite_sustained", lambda f, p: _finite(f), "non_finite_time", LANDS, LATCHED),
 
     Condition("devices_missing", lambda f, p: not f.missing, None, WARNS, WELL),
+    Condition("must_not_arm", lambda f, p: not (f.obstacles and f.phase is Phase.PREFLIGHT), None, WARNS_GROUNDED,
+              WELL),
 
     Condition("odometry_late", lambda f, p: abs(f.age_odometry) <= p.odometry_late, None, HOLDS, WELL),
     Condition("odometry_lost", lambda f, p: abs(f.age_odometry) <= p.odometry_lost, None, LANDS, LATCHED),
@@ -314,6 +319,10 @@ WORDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType({
     "devices_missing": (
         "a device has not told anything yet",
         "Waiting for the first word of: {f.missing}. Check power and cables if this stays.",
+    ),
+    "must_not_arm": (
+        "in PREFLIGHT, a reason not to arm from outside the core",
+        "The vehicle must not arm. {f.obstacles}",
     ),
 
     "odometry_late": (

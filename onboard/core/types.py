@@ -72,6 +72,8 @@ class Inputs(Struct, frozen=True, gc=False):
     autopilot: AutopilotState | None
     servos: ServoState | None
     request: Request | None = None
+    obstacles: tuple[str, ...] = ()
+    """Sentences on why the vehicle must not arm, from outside the core."""
 
 
 class Estimate(Struct, frozen=True, gc=False):

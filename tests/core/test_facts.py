@@ -105,6 +105,21 @@ def test_the_devices_that_have_told_something_are_watched_meanwhile() -> None:
     assert {"devices_missing", "odometry_late", "odometry_lost", "non_finite"} <= set(verdict.reasons)
 
 
+@pytest.mark.parametrize("seen", [SEEN, replace(SEEN, servos=None)], ids=["seen", "waiting"])
+@pytest.mark.parametrize("phase", Phase)
+def test_before_arming_and_only_then_every_obstacle_is_told(phase: Phase, seen: estimating.State) -> None:
+    obstacles = ("The servos are emulated.", "COM_OF_LOSS_T is 1, and must be 0.5.")
+    told = facts.for_safety(seen, HIGH, inputs(obstacles=obstacles), phase, True, True, REFERENCE, None)
+    _, verdict, said = safety.step(safety.initial(), told, CONFIG.safety, 0.004)
+    reasons = set(verdict.reasons) - {"devices_missing"}
+    if phase is Phase.PREFLIGHT:
+        assert reasons == {"must_not_arm"}
+        assert verdict.action is Action.WARN
+        assert all(sentence in said[-1][2] for sentence in obstacles)
+    else:
+        assert not reasons
+
+
 @pytest.mark.parametrize("phase", Phase)
 def test_contact_is_expected_at_the_pipe_and_on_the_way_back_from_it(phase: Phase) -> None:
     at_pipe = {"advance", "press", "release", "retreat", "retreat_hold", "retreat_land"}

@@ -48,6 +48,7 @@ CASES = [
     Case("non_finite", {}, {"inputs_finite": False}, 0.0, WARN, WARN, also=("non_finite_sustained",)),
     Case("non_finite_sustained", {}, {"inputs_finite": False}, 0.1, LAND, LAND, latched=True, also=("non_finite",)),
     Case("devices_missing", {}, {"missing": "servos"}, 0.0, WARN, WARN),
+    Case("must_not_arm", {}, {"obstacles": "A cable is loose."}, 0.0, WARN, Action.NONE, base=GROUND),
     Case("odometry_late", {"age_odometry": 0.15}, {"age_odometry": 0.151}, 0.0, HOLD, RETREAT),
     Case("odometry_lost", {"age_odometry": 0.5}, {"age_odometry": 0.501}, 0.0, LAND, LAND, latched=True,
          also=("odometry_late",)),

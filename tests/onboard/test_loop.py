@@ -17,6 +17,7 @@ from onboard.core.types import Inputs, Outputs, Phase, Request, Tick
 from onboard.devices import DeviceSet, mock_devices, world_of
 from onboard.loop import KEYFRAME_PERIOD_NS, Loop
 from onboard.records import Timing
+from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
 from sim_backend.world import World
 
 PERIOD_NS = 4_000_000
@@ -41,16 +42,16 @@ class Kept:
 
 
 class LateClock:
-    """A clock that comes back late from the sleeps named in ``late`` (ns, by their number from 0).
+    """A clock that comes back late from the sleeps named in ``late`` (ns, by their number from 0)."""
 
-    ``work``: what every tick takes, ns.
-    """
-
-    def __init__(self, late: dict[int, int], work: int = 0) -> None:
+    def __init__(self, late: dict[int, int]) -> None:
         self._now = 7_000_000_000
         self._late = late
-        self._work = work
         self._sleeps = 0
+
+    def work(self, duration_ns: int) -> None:
+        """Let time pass within a tick."""
+        self._now += duration_ns
 
     def now_ns(self) -> int:
         return self._now
@@ -160,30 +161,69 @@ class Logged:
         self._log.append(f"command {self._name}")
 
 
+class LoggedSet(DeviceSet):
+    """Three logged devices, whose set notes what is done with it too."""
+
+    def __init__(self, log: list[str]) -> None:
+        autopilot, odometry, servos = (Logged(name, log, None) for name in ("autopilot", "odometry", "servos"))
+        super().__init__(autopilot, odometry, servos)  # type: ignore[arg-type]
+        self._log = log
+
+    def relay(self) -> None:
+        self._log.append("relay")
+
+
+class Forbidden(DeviceSet):
+    """The devices of a world, with something amiss until ``seconds`` of it have passed."""
+
+    def __init__(self, world: World, seconds: float) -> None:
+        given = mock_devices(world)
+        super().__init__(given.autopilot, given.odometry, given.servos)
+        self._world, self._seconds = world, seconds
+
+    def obstacles(self) -> tuple[str, ...]:
+        return ("A cable is loose.",) if self._world.truth().t < self._seconds else ()
+
+
 def test_all_is_read_before_and_all_commanded_after_each_step(config: Config) -> None:
     log: list[str] = []
-    names = ("odometry", "autopilot", "servos")
-    odometry, autopilot, servos = (Logged(name, log, None) for name in names)
-    devices = DeviceSet(autopilot, odometry, servos)  # type: ignore[arg-type]
 
     def on_tick(outputs: Outputs) -> bool:
         log.append("told")
         return log.count("told") < 2
 
-    asyncio.run(Loop(devices, VirtualClock(lambda duration: None), config, Kept()).run(on_tick))
-    tick = [*(f"read {name}" for name in names), "command autopilot", "command servos", "told"]
+    asyncio.run(Loop(LoggedSet(log), VirtualClock(lambda duration: None), config, Kept()).run(on_tick))
+    reads = [f"read {name}" for name in ("odometry", "autopilot", "servos")]
+    tick = [*reads, "command autopilot", "command servos", "relay", "told"]
     assert log == tick * 2
 
 
 def test_without_any_sample_nothing_moves(config: Config) -> None:
     log: list[str] = []
-    devices = DeviceSet(*(Logged(name, log, None) for name in ("a", "o", "s")))  # type: ignore[arg-type]
     kept = Kept()
-    loop = Loop(devices, VirtualClock(lambda duration: None), config, kept)
+    loop = Loop(LoggedSet(log), VirtualClock(lambda duration: None), config, kept)
     loop.request(Request.START)
     asyncio.run(loop.run(lambda outputs: len(kept.ticks) < 50))
     assert {tick.outputs.phase for tick in kept.ticks} == {Phase.PREFLIGHT}
     assert {tick.outputs.autopilot.engage for tick in kept.ticks} == {Engage.IDLE}
+
+
+def test_an_obstacle_keeps_the_vehicle_on_the_ground_until_it_is_gone(config: Config) -> None:
+    world, kept = world_of(config), Kept()
+    clock = VirtualClock(world.advance)
+    loop = Loop(Forbidden(world, 0.5), clock, config, kept)
+    asks = [0.4, 2.0]
+
+    def on_tick(outputs: Outputs) -> bool:
+        if asks and clock.now_ns() * 1e-9 >= asks[0]:
+            asks.pop(0)
+            loop.request(Request.START)
+        return clock.now_ns() < 2_100_000_000
+
+    asyncio.run(loop.run(on_tick))
+    codes = [event.code for tick in kept.ticks for event in tick.outputs.events]
+    assert codes == ["must_not_arm", "refused_not_ready", "must_not_arm_cleared", "start"]
+    assert "A cable is loose." in kept.ticks[0].outputs.events[0].text
 
 
 def test_an_infeasible_mission_is_refused_before_the_first_tick(config: Config) -> None:
@@ -201,6 +241,25 @@ def test_a_late_tick_is_told(config: Config, late: int, warned: bool) -> None:
     assert ("tick_late" in tick.outputs.verdict.reasons) is warned
     assert kept.timings[5].late == pytest.approx(late * 1e-9)
     assert [timing.late for timing in kept.timings[:5]] == [0.0] * 5
+
+
+def test_the_way_of_the_set_point_is_timed(config: Config) -> None:
+    clock = LateClock({})
+
+    class Slow(MockAutopilot):
+        def command(self, command: AutopilotCommand) -> None:
+            clock.work(300_000)
+            super().command(command)
+
+    class Relaying(DeviceSet):
+        def relay(self) -> None:
+            clock.work(200_000)
+
+    world, kept = world_of(config), Kept()
+    devices = Relaying(Slow(world), MockOdometry(world), MockServos(world))
+    asyncio.run(Loop(devices, clock, config, kept, timed=True).run(lambda outputs: len(kept.ticks) < 3))
+    assert [timing.sent for timing in kept.timings] == pytest.approx([0.0003] * 3)
+    assert [timing.busy for timing in kept.timings] == pytest.approx([0.0005] * 3)
 
 
 def test_a_little_late_the_loop_catches_up(config: Config) -> None:
