@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
+from typing import NoReturn
 
-COMPLETED, BROKEN, WRONG_INPUT, SAFE, LOST, INTERRUPTED = 0, 1, 2, 3, 4, 130
+from groundstation.desk import Desk, WorldError
+
+COMPLETED, BROKEN, WRONG_INPUT, SAFE, LOST, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
 EXIT_CODES = {"completed": COMPLETED, "safe": SAFE, "unfinished": SAFE, "lost": LOST}
 
 _EPILOG = """\
@@ -32,6 +37,20 @@ examples:
   pipewright sim --law paper --out runs/as-printed     with the equations and Table I as printed
   pipewright sim --set repair.force=3 --set pipe.heading_deg=45 --set pipe.position=[3,1,2]
   pipewright sim --scenario my-pipe.yaml --seed 7
+"""
+_DESK_EPILOG = """\
+The simulated world with an emulator for each device, and the flight process with the real drivers, are two processes.
+
+examples:
+  pipewright desk                                              all devices emulated
+  pipewright desk --config my-pipe.yaml --set repair.force=3
+  pipewright desk --set devices.servos.kind=mock               the servos straight from the world
+  pipewright desk --config sitl                                on a real PX4 (docs/px4.md)
+"""
+_ONBOARD_EPILOG = """\
+examples:
+  pipewright onboard --config jetson                           waits on the ground for what it is asked
+  pipewright onboard --config /etc/pipewright.yaml --mission --out /var/log/pipewright/today
 """
 _LOG_HELP = "log.mcap of a run, or its run folder"
 
@@ -61,17 +80,37 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"pipewright {version('pipewright')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name, words in (
-        ("sim", "fly the whole repair in a simulated world, faster than real time"),
-        ("desk", "fly it in real time against a stand-in autopilot"),
-    ):
-        fly = commands.add_parser(
-            name, help=words, description=words.capitalize() + ".", epilog=_SIM_EPILOG.replace(" sim ", f" {name} "),
-            formatter_class=raw,
-        )  # fmt: skip
-        fly.add_argument("--scenario", metavar="NAME|FILE", help="where the pipe is and what to do (default: paper)")
-        fly.add_argument("--law", metavar="paper|tuned", help="controller parameters (default: tuned)")
-        fly.add_argument(
+    words = "fly the whole repair in a simulated world, faster than real time"
+    sim = commands.add_parser(
+        "sim", help=words, description=words.capitalize() + ".", epilog=_SIM_EPILOG, formatter_class=raw
+    )
+    sim.add_argument("--scenario", metavar="NAME|FILE", help="where the pipe is and what to do (default: paper)")
+    sim.set_defaults(run=_sim)
+    words = "fly it in real time, real drivers against emulated devices"
+    desk = commands.add_parser(
+        "desk", help=words, description=words.capitalize() + ".", epilog=_DESK_EPILOG, formatter_class=raw
+    )
+    desk.add_argument(
+        "--config", dest="scenario", default="desk", metavar="NAME|FILE", help="devices, pipe, task (default: desk)"
+    )
+    desk.add_argument("--duration", type=float, metavar="SECONDS", help="land after this time")
+    desk.set_defaults(run=_desk)
+    words = "fly with the devices of this machine: the process of the vehicle's computer"
+    onboard = commands.add_parser(
+        "onboard", help=words, description=words.capitalize() + ".", epilog=_ONBOARD_EPILOG, formatter_class=raw
+    )
+    onboard.add_argument("--config", dest="scenario", required=True, metavar="NAME|FILE", help="devices, pipe, task")
+    onboard.add_argument("--duration", type=float, metavar="SECONDS", help="land after this time")
+    onboard.add_argument("--mission", action="store_true", help="fly the whole mission once preflight passes, then end")
+    onboard.set_defaults(run=_onboard)
+    words = "hold a simulated world with emulated devices for a flight process elsewhere"
+    world = commands.add_parser("world", help=words, description=words.capitalize() + ".")
+    world.add_argument("--config", dest="scenario", required=True, metavar="NAME|FILE", help="devices, pipe, task")
+    world.add_argument("--servo-link", type=Path, metavar="PATH", help="symbolic link to make to the servo bus")
+    world.set_defaults(run=_world)
+    for command in (sim, desk, onboard, world):
+        command.add_argument("--law", metavar="paper|tuned", help="controller parameters (default: tuned)")
+        command.add_argument(
             "--set",
             action="append",
             default=[],
@@ -79,10 +118,10 @@ def _parser() -> argparse.ArgumentParser:
             metavar="KEY=VALUE",
             help="set any parameter; may be repeated",
         )
-        fly.add_argument("--seed", type=int, metavar="N", help="of everything random in the world (default: 0)")
-        fly.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
-        fly.add_argument("--no-progress", action="store_true", help="no progress bar")
-        fly.set_defaults(run=_fly, command=name)
+        command.add_argument("--seed", type=int, metavar="N", help="of everything random in the world (default: 0)")
+    for command in (sim, desk, onboard):
+        command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
+        command.add_argument("--no-progress", action="store_true", help="no progress bar")
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")
     replay.add_argument("log", type=Path, metavar="LOG", help=_LOG_HELP)
@@ -107,17 +146,62 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _fly(options: argparse.Namespace) -> int:
-    begun = time.perf_counter()
-    out = _run_folder(options.out) if options.out is not None else _new_folder(options.scenario, options.law)
-    arguments = [options.command, "--out", str(out)]
-    given = {name: getattr(options, name) for name in ("scenario", "law", "seed")}
+def _sim(options: argparse.Namespace) -> int:
+    begun, out = time.perf_counter(), _out(options)
+    before = _written(out / "log.mcap")
+    code = _flight_process(["sim", *_common(options), *_run_options(options, out)])
+    return _outcome(code, out / "log.mcap", before, begun)
+
+
+def _desk(options: argparse.Namespace) -> int:
+    begun, out = time.perf_counter(), _out(options)
+    before = _written(out / "log.mcap")
+    arguments = ["--mission", *_run_options(options, out)]
+    arguments += [] if options.duration is None else [f"--duration={options.duration}"]
+    try:
+        with Desk(_common(options)) as desk:
+            endpoints = desk.start_world()
+            with _passing_on(desk.pass_on):
+                code = _told(desk.fly(arguments, endpoints))
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    except WorldError as error:
+        if error.code not in (WRONG_INPUT, NO_DEVICE):
+            print(f"pipewright: {error}", file=sys.stderr)
+        code = error.code
+    return _outcome(code, out / "log.mcap", before, begun)
+
+
+def _onboard(options: argparse.Namespace) -> int:
+    arguments = ["fly", *_common(options), *_run_options(options, _out(options))]
+    arguments += [] if options.duration is None else [f"--duration={options.duration}"]
+    _become([*arguments, "--mission"] if options.mission else arguments)
+
+
+def _world(options: argparse.Namespace) -> int:
+    link = [] if options.servo_link is None else [f"--servo-link={options.servo_link}"]
+    _become(["world", *_common(options), *link])
+
+
+def _common(options: argparse.Namespace) -> list[str]:
+    """What every flight and every world is told."""
+    name = "--config" if options.run is not _sim else "--scenario"
+    arguments = [] if options.scenario is None else [f"{name}={options.scenario}"]
+    given = {name: getattr(options, name) for name in ("law", "seed")}
     arguments += [f"--{name}={value}" for name, value in given.items() if value is not None]
-    arguments += [f"--set={item}" for item in options.sets]
-    arguments += ["--no-progress"] if options.no_progress else []
-    log = out / "log.mcap"
-    before = _written(log)
-    code = _onboard(arguments)
+    return [*arguments, *(f"--set={item}" for item in options.sets)]
+
+
+def _run_options(options: argparse.Namespace, out: Path) -> list[str]:
+    return ["--out", str(out), *(["--no-progress"] if options.no_progress else [])]
+
+
+def _out(options: argparse.Namespace) -> Path:
+    return _run_folder(options.out) if options.out is not None else _new_folder(options.scenario, options.law)
+
+
+def _outcome(code: int, log: Path, before: int, begun: float) -> int:
+    """Report what the flight process has recorded, and make of its exit code that of the command."""
     if code == WRONG_INPUT:
         return WRONG_INPUT
     recorded = _written(log) != before
@@ -125,7 +209,7 @@ def _fly(options: argparse.Namespace) -> int:
         rest = "what it recorded is reported" if recorded else "it recorded nothing"
         print(f"pipewright: the flight process failed (code {code}); {rest}", file=sys.stderr)
     if not recorded:
-        return INTERRUPTED if code == INTERRUPTED else BROKEN
+        return code if code in (INTERRUPTED, NO_DEVICE) else BROKEN
     outcome = _evaluate(log, partial=True, begun=begun)
     return EXIT_CODES[outcome] if code == COMPLETED else INTERRUPTED if code == INTERRUPTED else BROKEN
 
@@ -134,7 +218,7 @@ def _replay(options: argparse.Namespace) -> int:
     arguments = ["replay", str(_log(options.log))]
     arguments += [f"--from={options.start}"] if options.start is not None else []
     arguments += ["--partial"] if options.partial else []
-    return _onboard(arguments)
+    return _flight_process(arguments)
 
 
 def _report(options: argparse.Namespace) -> int:
@@ -171,30 +255,55 @@ def _evaluate(log: Path, *, partial: bool, begun: float | None = None, beside: S
     return str(figures["outcome"])
 
 
-def _onboard(arguments: list[str]) -> int:
-    """Run the flight process in this terminal; gives its exit code.
+def _flight_process(arguments: list[str]) -> int:
+    """Run an onboard process in this terminal; gives its exit code.
 
     It has a process group of its own and every interrupt is passed on to it once, so that it can end in order.
     """
     child: subprocess.Popen[bytes] | None = None
     early: list[int] = []
 
-    def pass_on(number: int, frame: FrameType | None) -> None:
+    def pass_on(number: int) -> None:
         if child is None:
             early.append(number)
         else:
             child.send_signal(number)
 
-    former = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        child = subprocess.Popen([sys.executable, "-P", "-m", "onboard", *arguments], process_group=0)
+    with _passing_on(pass_on):
+        child = subprocess.Popen(_command(arguments), process_group=0)
         for number in early:
             child.send_signal(number)
-        code = child.wait()
+        return _told(child.wait())
+
+
+@contextmanager
+def _passing_on(hear: Callable[[int], None]) -> Iterator[None]:
+    """Hand interrupts to ``hear`` instead of ending at once."""
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        hear(number)
+
+    former = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
     finally:
         for number, handler in former.items():
             signal.signal(number, handler)
+
+
+def _told(code: int) -> int:
+    """The exit code of a child; one that was ended by an interrupt was interrupted."""
     return INTERRUPTED if code in (-signal.SIGINT, -signal.SIGTERM) else code
+
+
+def _become(arguments: list[str]) -> NoReturn:
+    """Go on as an onboard process: same process id, so that a service manager sees the flight itself."""
+    command = _command(arguments)
+    os.execv(command[0], command)
+
+
+def _command(arguments: list[str]) -> list[str]:
+    return [sys.executable, "-P", "-m", "onboard", *arguments]
 
 
 def _log(path: Path) -> Path:

@@ -10,10 +10,11 @@ from pathlib import Path
 from msgspec import Struct
 
 from drivers.mailbox import Level, Notice
+from onboard import attended
 from onboard.clock import WallClock
 from onboard.config import Config, dump_config
 from onboard.core.step import State
-from onboard.core.types import Event, Outputs, Severity, Tick
+from onboard.core.types import Event, Outputs, Phase, Request, Severity, Tick
 from onboard.devices import FlightDevices
 from onboard.errand import Errand
 from onboard.loop import Loop
@@ -36,7 +37,7 @@ class Options(Struct, frozen=True):
     duration: float | None = None
     """Ask for the landing after so many seconds."""
     attended: bool = False
-    """End in order when standard input closes."""
+    """Take requests as lines of standard input, and end in order when it closes."""
 
 
 class _Sink:
@@ -91,6 +92,7 @@ class _Flight:
         self._config, self._options, self._devices = config, options, devices
         self._watch, self._say = watch, say
         self._clock = WallClock()
+        self._ready = False
 
     async def run(self, log: Path) -> None:
         """Tick until the flight is over."""
@@ -105,6 +107,8 @@ class _Flight:
             # what lives by now lives to the end: the collector need not look at it in flight
             gc.collect()
             gc.freeze()
+            if self._options.attended:
+                attended.watch(self._order, self._end)
             try:
                 await self._loop.run(self._on_tick)
             finally:
@@ -119,11 +123,24 @@ class _Flight:
         t = (self._clock.now_ns() - self._first) * 1e-9
         self._watch(outputs, t)
         self._devices.tell_phase(outputs.phase.value)
+        for event in outputs.events:
+            if event.severity is not Severity.INFO:
+                self._say(event.text)
         for notice in self._devices.notices():
             self._tell(notice)
+        if not self._ready and outputs.phase is Phase.PREFLIGHT and outputs.estimate.valid and not outputs.verdict.reasons:
+            self._ready = True
+            self._say("ready to fly: preflight passes")
         if self._devices.lost:
             return False
         return self._errand is None or self._errand.goes_on(outputs, t)
+
+    def _order(self, line: str) -> None:
+        """A request from standard input, in a thread of its own."""
+        try:
+            self._loop.request(Request(line.strip()))
+        except ValueError:
+            self._say(f"no such request: {line.strip()!r}; there are: {', '.join(Request)}")
 
     def _look(self, look: Look) -> None:
         self._recorder.truth(look.t_ns, look.truth)

@@ -1,0 +1,157 @@
+"""A flight of two processes, as on the desk, watched and disturbed from outside."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+from groundstation.desk import Desk, end, start
+from sim_backend.world_client import WorldClient
+from sim_backend.world_messages import Look
+
+#: Whatever is waited for comes well before this, s: the machine may be busy.
+PATIENCE = 60.0
+#: A brisk flight: takes off to 0.8 m and presses about 25 s later.
+BRISK = (
+    "pipe.position=[1.6,0,1.2]",
+    "plan.takeoff_height=0.8",
+    "plan.standoff=0.8",
+    "plan.gap=0.03",
+    "plan.speed=0.8",
+    "plan.acceleration=0.8",
+    "plan.jerk=2",
+    "plan.near_speed=0.25",
+    "plan.advance_speed=0.015",
+    "plan.arm_speed=0.25",
+    "plan.needle_speed=0.1",
+    "plan.arc_max=0.1",
+    "plan.retreat=0.2",
+    "plan.descent_speed=0.3",
+    "guidance.tare_settle=1",
+    "guidance.tare_time=1",
+    "force_profile.settle=0.5",
+    "force_profile.bias_hold=0.5",
+    "force_profile.ramp=3",
+    "repair.force=1.5",
+    "repair.hold=20",
+)
+
+
+class Flying:
+    """World and flight process of one configuration. Use as a context manager."""
+
+    def __init__(self, folder: Path, *sets: str, config: str = "desk") -> None:
+        self.folder = folder
+        self._common = [f"--config={config}", *(f"--set={item}" for item in (*BRISK, *sets))]
+        self.looks: list[Look] = []
+        self._said: list[str] = []
+
+    def __enter__(self) -> Flying:
+        self._desk = Desk(self._common)
+        self.endpoints = self._desk.start_world()
+        self.client = WorldClient(self.endpoints["devices.world"], on_look=self.looks.append)
+        self.client.start(PATIENCE)
+        sets = [f"--set={path}={value}" for path, value in self.endpoints.items()]
+        out = ["--out", str(self.folder), "--no-progress"]
+        self.flight = start(["fly", *self._common, *sets, "--attended", *out], stderr=subprocess.PIPE)
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self.flight.poll() is None:
+            os.kill(self.flight.pid, signal.SIGCONT)
+        end(self.flight)
+        self._listener.join(PATIENCE)
+        if self.flight.stderr is not None:
+            self.flight.stderr.close()
+        self.client.stop()
+        self._desk.__exit__(None, None, None)
+        if error is not None:
+            error.add_note("the flight process said:\n" + "\n".join(self._said))
+
+    def _listen(self) -> None:
+        assert self.flight.stderr is not None
+        for line in self.flight.stderr:
+            self._said.append(line.rstrip())
+
+    # -- what may be done -----------------------------------------------------------------------------------------
+
+    def ask(self, request: str) -> None:
+        """A request for the mission."""
+        assert self.flight.stdin is not None
+        self.flight.stdin.write(f"{request}\n")
+        self.flight.stdin.flush()
+
+    def inject(self, **fault: object) -> None:
+        """A fault of an emulated device, that begins now."""
+        self._desk.order(json.dumps(fault))
+
+    def signal(self, number: int) -> None:
+        """A signal for the flight process."""
+        self.flight.send_signal(number)
+
+    # -- what may be seen -----------------------------------------------------------------------------------------
+
+    def look(self) -> Look:
+        """How the world looks now."""
+        return self.looks[-1]
+
+    def said(self, words: str) -> list[str]:
+        """What the flight process has said on standard error with these words in it."""
+        return [line for line in self._said if words in line]
+
+    def wait(self, what: str, happens: Callable[[Look], bool], patience: float = PATIENCE) -> Look:
+        """The first look at which something is so, from now on. Fails, saying ``what``, when it never comes."""
+        seen = len(self.looks) - 1
+        until = time.monotonic() + patience
+        while time.monotonic() < until:
+            while seen < len(self.looks):
+                if happens(self.looks[seen]):
+                    return self.looks[seen]
+                seen += 1
+            time.sleep(0.01)
+        truth = self.look().truth
+        raise AssertionError(f"not within {patience:g} s: {what}; the vehicle is at {truth.p_WB}")
+
+    def wait_said(self, words: str, patience: float = PATIENCE) -> str:
+        """The first sentence of the flight process with these words in it."""
+        until = time.monotonic() + patience
+        while time.monotonic() < until:
+            if lines := self.said(words):
+                return lines[0]
+            time.sleep(0.01)
+        raise AssertionError(f"not said within {patience:g} s: {words}")
+
+    def take_off(self) -> Look:
+        """Up to the hover."""
+        self.wait_said("ready")
+        self.ask("takeoff")
+        return self.wait("hover", lambda look: look.truth.p_WB[2] > 0.75)
+
+    def press(self) -> Look:
+        """The whole way to a steady press."""
+        self.wait_said("ready")
+        self.ask("start")
+        return self.wait("press", lambda look: look.truth.contact_force > 1.2, 3 * PATIENCE)
+
+    def ended_safely(self, patience: float = PATIENCE) -> Look:
+        """On the ground, motors off, nothing broken."""
+        look = self.wait("on the ground, disarmed", lambda look: look.truth.on_ground and not look.armed, patience)
+        assert look.truth.crashed == ""
+        return look
+
+
+@contextmanager
+def flying(folder: Path, *sets: str) -> Iterator[Flying]:
+    """A flight in a folder of its own."""
+    with Flying(folder, *sets) as flight:
+        yield flight
