@@ -81,13 +81,15 @@ class Loop:
             before = state
             state, outputs = step(state, inputs, params, inputs.dt)
             devices.autopilot.command(outputs.autopilot)
+            sent = clock.now_ns() if self._timed else now
             devices.servos.command(outputs.servos)
             if now >= keyframe_due:
                 sink.keyframe(index, now, before)
                 keyframe_due += KEYFRAME_PERIOD_NS
             sink.tick(Tick(index, self.revision, inputs, outputs))
             if self._timed:
-                sink.timing(Timing(index, now, (now - due) * 1e-9, (clock.now_ns() - now) * 1e-9))
+                busy = clock.now_ns() - now
+                sink.timing(Timing(index, now, (now - due) * 1e-9, busy * 1e-9, (sent - now) * 1e-9))
             self._state, self.outputs = state, outputs
             if not on_tick(outputs):
                 return

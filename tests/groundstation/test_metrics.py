@@ -208,7 +208,9 @@ def test_timing_of_a_wall_clock_run(tmp_path: Path) -> None:
     with Recorder(path, info, ConfigStub(), "") as recorder:
         for tick, _ in CYCLES[:501:2]:
             recorder.tick(tick)
-            recorder.timing(Timing(tick.index, tick.inputs.t_ns, late=0.001 + 1e-6 * tick.index, busy=0.0005))
+            recorder.timing(
+                Timing(tick.index, tick.inputs.t_ns, late=0.001 + 1e-6 * tick.index, busy=0.0005, sent=0.0003)
+            )
     timing = compute(read_run(path))["timing"]
     assert timing["rates"] == pytest.approx({"tick": 125, "odometry": 125, "autopilot": 125, "servos": 125})
     assert timing["late"]["max"] == pytest.approx(0.0015)

@@ -122,7 +122,7 @@ def test_wall_clock_run_shows_its_punctuality(tmp_path: Path) -> None:
     with Recorder(tmp_path / "log.mcap", info, ConfigStub(), "") as recorder:
         for tick, truth in CYCLES[:500]:
             recorder.tick(tick, truth)
-            recorder.timing(Timing(tick.index, tick.inputs.t_ns, 0.0012, 0.0004))
+            recorder.timing(Timing(tick.index, tick.inputs.t_ns, 0.0012, 0.0004, 0.0003))
     run = read_run(tmp_path / "log.mcap")
     report.write(run, metrics.compute(run), tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -217,7 +217,7 @@ def test_full_disk_is_told_and_the_flight_goes_on(tmp_path: Path) -> None:
     stick(recorder, OSError(28, "No space left on device")).released.set()
     for tick, truth in CYCLES[:200]:
         recorder.tick(tick, truth)
-    recorder.timing(Timing(0, 0, 0.0, 0.0))
+    recorder.timing(Timing(0, 0, 0.0, 0.0, 0.0))
     recorder.close()
     assert isinstance(recorder.error, OSError)
     assert recorder.dropped > 0
