@@ -7,6 +7,7 @@ from html import escape
 
 import numpy as np
 
+from groundstation import punctuality
 from groundstation.metrics import phases, plane, windows
 from groundstation.run import Array, Mask, Run
 from groundstation.svg import Chart, Range, ticks
@@ -110,17 +111,20 @@ def at_the_pipe(run: Run) -> list[Chart]:
     drawing.circle(0.0, 0.0, radius, "pipe").circle(0.0, 0.0, radius + gap, "path")
     _trace(run, drawing, run.truth.needle, run.where(Phase.ADHESIVE) & ~run.dispensing, "needle", "c3 faint")
     _trace(run, drawing, run.truth.needle, run.dispensing, "dispensing", "c3 thick")
-    touching = run.where(Phase.ADVANCE, Phase.PRESS, Phase.RELEASE, Phase.RETREAT)
-    _trace(run, drawing, run.truth.tip, touching, "sleeve tip", "c2")
+    near = run.where(Phase.ADVANCE, Phase.PRESS, Phase.RELEASE, Phase.RETREAT)
+    _trace(run, drawing, run.truth.tip, near, "sleeve tip", "c2")
     charts = [drawing]
-    if run.dispensing.any():
-        ahead, up, aside = (1000.0 * values[run.dispensing] for values in plane(run, run.truth.needle))
-        t = run.t[run.dispensing]
+    dispensing = run.dispensing & run.truth.known
+    if dispensing.any():
+        ahead, up, aside = (1000.0 * values[dispensing] for values in plane(run, run.truth.needle))
+        t = run.t[dispensing]
         errors = Chart("needle off its path while dispensing", "mm", (float(t[0]), float(t[-1])))
         errors.line(t, np.hypot(ahead, up) - radius - gap, "outwards", "c1").line(t, aside, "along the axis", "c3")
         charts.append(errors)
-    span = windows(run).touch
-    if span.stop - span.start > 1:
+    touching = np.zeros(len(run.t), dtype=np.bool_)
+    touching[windows(run).touch] = True
+    span = np.flatnonzero(touching & run.truth.known)
+    if len(span) > 1:
         ahead, up, aside = (1000.0 * values[span] for values in plane(run, run.truth.tip))
         t = run.t[span]
         drift = Chart("sleeve on the pipe, against touchdown", "mm", (float(t[0]), float(t[-1])))
@@ -131,18 +135,48 @@ def at_the_pipe(run: Run) -> list[Chart]:
     return charts
 
 
-def punctuality(run: Run) -> list[Chart]:
-    """Lateness of the loop and ages of the samples, for a wall-clock run."""
-    if not run.late.size:
+def loop(run: Run) -> list[Chart]:
+    """How punctual the ticks of a wall-clock run were: a histogram, and all of them over time."""
+    late = 1000.0 * np.maximum(run.late[np.isfinite(run.late)], 0.0)
+    if not late.size:
         return []
-    x = whole(run)
-    t = run.t[-len(run.late) :]
-    late = Chart("lateness and duration of the ticks", "ms", x)
-    late.line(t, 1000.0 * run.late[-len(t) :], "late", "c2").line(t, 1000.0 * run.busy[-len(t) :], "busy", "c1")
-    ages = Chart("age of the newest samples", "ms", x)
-    for i, (name, values) in enumerate(run.ages.items()):
-        ages.line(run.t, 1000.0 * values, name, f"c{i + 1}")
-    return [late, ages]
+    edges = np.geomspace(0.01, 1000.0, 41)
+    # A tick that is less late than the first edge is shown at the first bar.
+    counts, _ = np.histogram(np.clip(late, edges[0], edges[-1]), bins=edges)
+    histogram = Chart("lateness of the ticks", "ticks", (0.01, 1000.0), log="xy", x_label="late by, ms")
+    for low, high, count in zip(edges[:-1].tolist(), edges[1:].tolist(), counts.tolist(), strict=True):
+        histogram.bar(low, high, float(count), f"late by {low:.3g} to {high:.3g} ms: {count} ticks")
+    period = 1000.0 * float(np.nanmedian(punctuality.periods(run))) if len(run.t) > 1 else 0.0
+    if edges[0] < period < edges[-1]:
+        histogram.mark(period, "one period")
+    x, t = whole(run), run.t
+    periods = Chart("from tick to tick", "ms", x)
+    periods.line(t[1:], 1000.0 * punctuality.periods(run), "", "c1")
+    punctual = Chart("lateness and duration of the ticks", "ms", x)
+    punctual.line(t, 1000.0 * run.late, "late", "c2").line(t, 1000.0 * run.busy, "busy", "c1")
+    return [histogram, periods, punctual]
+
+
+def ages(run: Run) -> list[Chart]:
+    """Ages of what a wall-clock run had at its ticks and of what it sent: over time, and how often how old."""
+    kinds = {**run.ages, "set-point": punctuality.setpoint_ages(run)}
+    over_time = Chart("age of the newest samples, and of each set-point as it left", "ms", whole(run))
+    often = Chart("how often older than so much", "% of ticks", (0.1, 1000.0), log="xy", x_label="age, ms")
+    for i, (name, values) in enumerate(kinds.items()):
+        over_time.line(run.t, 1000.0 * values, name, f"c{i + 1}")
+        ordered = np.sort(1000.0 * values[np.isfinite(values)])
+        share = 100.0 * (1.0 - np.arange(len(ordered)) / max(1, len(ordered)))
+        often.line(ordered, share, name, f"c{i + 1}")
+    return [over_time, often]
+
+
+def processor(run: Run) -> list[Chart]:
+    """Share of a core that each part of the flight process took."""
+    chart = Chart("processor time of the parts of the flight process", "% of one core", whole(run), width=950)
+    values = {name: told for name, told in punctuality.device_values(run).items() if name.startswith(punctuality.CPU)}
+    for i, (name, (t, share)) in enumerate(values.items()):
+        chart.line(t, 100.0 * share, name[len(punctuality.CPU) :], f"c{i % 6 + 1}")
+    return [chart] if values else []
 
 
 def timeline(run: Run) -> str:

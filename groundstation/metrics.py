@@ -2,7 +2,7 @@
 
 Windows: ``flight`` runs from the end of takeoff to the start of landing; ``contact`` from the trigger (first tick of
 the press) to the release. Errors are taken against the reference the loop follows, from the truth of the world where
-there is one, else from the estimate.
+there is one, else from the estimate. Ticks without a fresh truth are left out of what is taken from the truth.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from groundstation.run import DEVICES, Array, Mask, Run
+from groundstation.punctuality import timing
+from groundstation.run import Array, Mask, Run
 from onboard.messages import Phase
 
 #: Table II of the paper, as printed: N, m, deg.
@@ -73,7 +74,7 @@ def compute(run: Run, wall_s: float | None = None) -> dict[str, Any]:
         "contact": _contact(run, window),
         "limits": _limits(run),
         "adhesive": _adhesive(run),
-        "timing": _timing(run),
+        "timing": timing(run),
         "paper": PAPER,
     }
 
@@ -142,6 +143,13 @@ def outcome(run: Run) -> str:
     return "completed" if installed and planned and Phase.RETURN in order and grounded else "safe"
 
 
+def _known(run: Run, span: slice) -> Mask:
+    """The ticks of a window that can be judged."""
+    known = np.zeros(len(run.t), dtype=np.bool_)
+    known[span] = True if run.truth is None else run.truth.known[span]
+    return known
+
+
 def _rmse(error: Array) -> float | None:
     return float(np.sqrt(np.mean(error * error))) if error.size and np.isfinite(error).all() else None
 
@@ -151,18 +159,17 @@ def _wrap(angle: Array) -> Array:
 
 
 def _force_rmse(run: Run, span: slice) -> dict[str, float | None]:
-    desired, estimated = run.force_des[span], run.force_est[span]
-    measured = run.truth.force[span] if run.truth is not None else None
-    return {
-        "est_des": _rmse(estimated - desired),
-        "meas_des": None if measured is None else _rmse(measured - desired),
-        "est_meas": None if measured is None else _rmse(estimated - measured),
-    }
+    own = {"est_des": _rmse(run.force_est[span] - run.force_des[span])}
+    if run.truth is None:
+        return {**own, "meas_des": None, "est_meas": None}
+    known = _known(run, span)
+    desired, estimated, measured = run.force_des[known], run.force_est[known], run.truth.force[known]
+    return {**own, "meas_des": _rmse(measured - desired), "est_meas": _rmse(estimated - measured)}
 
 
 def _state_rmse(run: Run, span: slice) -> dict[str, float | None]:
-    error = state_errors(run)
-    return {name: _rmse(error[name][span]) for name in STATES}
+    error, known = state_errors(run), _known(run, span)
+    return {name: _rmse(error[name][known]) for name in STATES}
 
 
 def state_errors(run: Run) -> dict[str, Array]:
@@ -185,24 +192,29 @@ def _contact(run: Run, window: Windows) -> dict[str, Any]:
     peak = truth.peak if truth is not None else run.force_est
     wanted = run.config.repair.force
     pressed, t = force[span], run.t[span]
-    hold = pressed[run.force_des[span] >= 0.999 * wanted]
+    hold = pressed[(run.force_des[span] >= 0.999 * wanted) & np.isfinite(pressed)]
     reached = np.flatnonzero(pressed >= 0.95 * wanted)
     touched = window.touch.stop > window.touch.start
-    gaps = _gaps(truth.force[window.touch] > 0.0, run.t[window.touch]) if truth is not None else []
+    gaps = _gaps(~(truth.force[window.touch] <= 0.0), run.t[window.touch]) if truth is not None else []
     return {
         "source": "truth" if truth is not None else "estimate",
-        "peak": float(np.max(peak[: span.stop])) if touched else None,
-        "touchdown_peak": float(np.max(peak[window.touch.start : _settled(run, window)])) if touched else None,
+        "peak": _largest(peak[: span.stop]) if touched else None,
+        "touchdown_peak": _largest(peak[window.touch.start : _settled(run, window)]) if touched else None,
         "hold_mean": float(np.mean(hold)) if hold.size else None,
         "hold_std": float(np.std(hold)) if hold.size else None,
-        "overshoot": max(0.0, float(np.max(peak[span])) - wanted) if pressed.size else None,
+        "overshoot": max(0.0, _largest(peak[span]) - wanted) if pressed.size else None,
         "time_to_95": float(t[reached[0]] - t[0]) if reached.size else None,
-        "tip_slip": float(truth.slip[span.stop - 1] - truth.slip[max(0, window.touch.start - 1)])
+        "tip_slip": _largest(truth.slip[: span.stop]) - _largest(truth.slip[: max(1, window.touch.start)])
         if truth is not None and touched
         else None,
         "bounces": len(gaps) if truth is not None and touched else None,
         "time_without_contact": float(sum(gaps)) if truth is not None and touched else None,
     }
+
+
+def _largest(values: Array) -> float:
+    """The largest known value; 0 when none is known."""
+    return float(np.max(values[np.isfinite(values)], initial=0.0))
 
 
 def _settled(run: Run, window: Windows) -> int:
@@ -226,8 +238,8 @@ def _limits(run: Run) -> dict[str, Any]:
     bounds = {"thrust_limit": vehicle.rotors.max_thrust, "torque_limit": vehicle.servo.stall_torque}
     if run.truth is None:
         return {"thrust_max": None, "torque_max": None, "thrust_by_rotor": None, "torque_by_joint": None, **bounds}
-    thrust = np.max(run.truth.thrust, axis=0)
-    torque = np.max(np.abs(run.truth.torque), axis=0)
+    thrust = np.max(run.truth.thrust[run.truth.known], axis=0, initial=0.0)
+    torque = np.max(np.abs(run.truth.torque[run.truth.known]), axis=0, initial=0.0)
     return {
         "thrust_max": float(thrust.max()),
         "torque_max": float(torque.max()),
@@ -248,33 +260,9 @@ def plane(run: Run, points: Array) -> tuple[Array, Array, Array]:
 
 
 def _adhesive(run: Run) -> dict[str, float | None]:
-    if run.truth is None or not run.dispensing.any():
+    if run.truth is None or not (chosen := run.dispensing & run.truth.known).any():
         return {"arc_deg": None, "path_error_rms": None}
-    ahead, up, aside = plane(run, run.truth.needle[run.dispensing])
+    ahead, up, aside = plane(run, run.truth.needle[chosen])
     angle = np.unwrap(np.arctan2(up, -ahead))
     radial = np.hypot(ahead, up) - (run.config.pipe.radius + run.config.plan.needle_gap)
     return {"arc_deg": float(np.degrees(np.ptp(angle))), "path_error_rms": _rmse(np.hypot(radial, aside))}
-
-
-def _timing(run: Run) -> dict[str, Any]:
-    """Achieved rates (Hz), ages of the samples and punctuality of the loop (s)."""
-    duration = float(run.t[-1]) or float("nan")
-    rates = {"tick": (len(run.t) - 1) / duration}
-    for name in DEVICES:
-        stamps = run.stamps[name][np.isfinite(run.stamps[name])]
-        rates[name] = float(np.count_nonzero(np.diff(stamps))) / duration
-    return {
-        "rates": rates,
-        "ages": {name: _spread(run.ages[name]) for name in DEVICES},
-        "late": _spread(run.late),
-        "busy": _spread(run.busy),
-        "missing_ticks": int(run.index[-1] - run.index[0] + 1 - len(run.index)),
-    }
-
-
-def _spread(values: Array) -> dict[str, float] | None:
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return None
-    median, p99 = np.percentile(finite, (50, 99))
-    return {"median": float(median), "p99": float(p99), "max": float(finite.max())}

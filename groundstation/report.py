@@ -126,11 +126,30 @@ def _timing(run: Run, metrics: dict[str, Any]) -> Iterator[str]:
     timing = metrics["timing"]
     if timing["late"] is None:
         return
+    yield "<h2>Punctuality</h2>"
+    if (missed := timing["missed"]) is not None:
+        words = (
+            f"{missed['count']} of the ticks owed were missed ({100 * missed['share']:.3f} %): {missed['late']} began "
+            f"more than one period ({1000 * missed['period']:g} ms) late, {missed['skipped']} never began. "
+            "Ages are those of the newest sample at each tick; that of a set-point counts from the attitude it answers "
+            "until it had left."
+        )
+        yield f'<p class="note">{escape(words)}</p>'
+    if timing["missing_ticks"]:
+        yield f'<p class="note">{timing["missing_ticks"]} ticks are missing in the log.</p>'
+    if timing["without_truth"]:
+        yield f'<p class="note">{timing["without_truth"]} ticks have no truth of the world beside them.</p>'
     headings = "".join(f'<th class="n">{words}</th>' for words in ("rate, Hz", "median, ms", "p99, ms", "max, ms"))
-    yield f"<h2>Punctuality</h2><table><tr><th></th>{headings}</tr>"
-    spreads = {"lateness of the tick": ("tick", timing["late"]), "duration of the tick": ("", timing["busy"])}
-    spreads |= {f"age of {name}": (name, spread) for name, spread in timing["ages"].items()}
-    for label, (rate, spread) in spreads.items():
+    yield f"<table><tr><th></th>{headings}</tr>"
+    rows: list[tuple[str, str, dict[str, float] | None]] = [
+        ("lateness of the tick", "tick", timing["late"]),
+        ("from tick to tick", "", timing["period"]),
+        ("tick begun to set-point sent", "", timing["sent"]),
+        ("duration of the tick", "", timing["busy"]),
+        *((f"age of {name}", name, spread) for name, spread in timing["ages"].items()),
+        ("age of a set-point as it left", "", timing["setpoint_age"]),
+    ]
+    for label, rate, spread in rows:
         hertz = f"{timing['rates'][rate]:.1f}" if rate else ""
         cells = "".join(
             f'<td class="n">{1000 * spread[key]:.2f}</td>' if spread else '<td class="n"></td>'
@@ -138,9 +157,28 @@ def _timing(run: Run, metrics: dict[str, Any]) -> Iterator[str]:
         )
         yield f'<tr><td>{escape(label)}</td><td class="n">{hertz}</td>{cells}</tr>'
     yield "</table>"
-    if timing["missing_ticks"]:
-        yield f'<p class="note">{timing["missing_ticks"]} ticks are missing in the log.</p>'
-    yield '<div class="pair">' + "".join(f"<div>{chart.svg()}</div>" for chart in figures.punctuality(run)) + "</div>"
+    for charts in (figures.loop(run), figures.ages(run)):
+        yield '<div class="pair">' + "".join(f"<div>{chart.svg()}</div>" for chart in charts) + "</div>"
+    yield from (chart.svg() for chart in figures.processor(run))
+    yield from _devices(
+        "Processor", "share of one core", {f"cpu.{k}": v for k, v in timing["cpu"].items()}, 100.0, " %"
+    )
+    yield from _devices("Devices", "reported once a second; times in s, rates in Hz", timing["devices"])
+
+
+def _devices(
+    heading: str, note: str, values: dict[str, dict[str, float] | None], scale: float = 1.0, unit: str = ""
+) -> Iterator[str]:
+    """What a run reported about itself once a second."""
+    if not values:
+        return
+    keys = ("min", "median", "max", "last")
+    yield f"<details><summary>{heading}: {note}</summary><table><tr><th></th>"
+    yield "".join(f'<th class="n">{key}</th>' for key in keys) + "</tr>"
+    for name, told in values.items():
+        cells = (f"{scale * told[key]:.4g}{unit}" if told else "" for key in keys)
+        yield f"<tr><td>{escape(name)}</td>" + "".join(f'<td class="n">{cell}</td>' for cell in cells) + "</tr>"
+    yield "</table></details>"
 
 
 def _events(run: Run) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,13 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from onboard.messages import (
+    DEVICES,
     EVENT,
     PARAMS,
     TICK,
     TIMING,
     TRUTH,
+    DeviceReport,
     Event,
     LogError,
     LogReader,
@@ -71,11 +74,16 @@ class _Control(Struct, gc=False):
     joints: Three
 
 
+class _Command(Struct, gc=False):
+    engage: str
+
+
 class _Outputs(Struct, gc=False):
     phase: str
     estimate: _Estimate
     reference: _Reference
     control: _Control
+    autopilot: _Command
 
 
 class _Tick(Struct, gc=False):
@@ -132,7 +140,11 @@ class _Revision(Struct):
 
 @dataclass(frozen=True)
 class Truths:
-    """What was true at each tick: n rows, NaN where nothing was recorded. SI, W, angles in rad."""
+    """What was true at each tick: n rows, NaN where nothing fresh was recorded. SI, W, angles in rad.
+
+    A simulated world is recorded with each tick. One in a process of its own is recorded at its own times: a tick then
+    has the newest truth at or before it, and none before the first or when that is older than ``TRUTH_LASTS``.
+    """
 
     p: Array
     rpy: Array
@@ -149,6 +161,8 @@ class Truths:
     """Largest contact force since the tick before, (n,)."""
     slip: Array
     """Tangential sliding so far, (n,)."""
+    known: Mask
+    """Ticks that have a truth, (n,)."""
     sleeve_on_pipe: bool
     """At the end."""
     on_ground: bool
@@ -190,10 +204,17 @@ class Run:
     landed: str
     """Last word of the autopilot's land detector."""
     truth: Truths | None
+    offboard: Mask
+    """A set-point was handed to the autopilot."""
     late: Array
     busy: Array
-    """Lateness and duration of the ticks of a wall-clock run, s."""
+    sent: Array
+    """Start of the tick against its schedule, its duration, and its part until the set-point had left, s; NaN where
+    nothing was recorded, as in every simulated run."""
+    devices: list[DeviceReport] = field(default_factory=list)
+    """How the devices did, about once a second of a wall-clock run."""
     events: list[Event] = field(default_factory=list)
+    """In order of their times."""
     start_ns: int = 0
 
     def where(self, *phases: str) -> Mask:
@@ -201,7 +222,9 @@ class Run:
         return np.isin(self.phase, phases)
 
 
-DEVICES = ("odometry", "autopilot", "servos")
+SOURCES = ("odometry", "autopilot", "servos")
+#: An older truth says nothing of a tick, s.
+TRUTH_LASTS = 0.05
 
 
 def read_run(path: Path, *, partial: bool = False) -> Run:
@@ -213,18 +236,26 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
     ticks: list[float] = []
     phases: list[str] = []
     truths: list[float] = []
-    truth_rows: list[int] = []
+    truth_ns: list[int] = []
     landed = ""
     last: _Truth | None = None
     crashed = ""
     events: list[Event] = []
     timings: list[Timing] = []
+    devices: list[DeviceReport] = []
     config: RunConfig | None = None
     start_ns = 0
     nowhere = float("nan")
-    kinds: dict[str, Any] = {TICK: _Tick, TRUTH: _Truth, EVENT: Event, TIMING: Timing, PARAMS: _Revision}
+    kinds: dict[str, Any] = {
+        TICK: _Tick,
+        TRUTH: _Truth,
+        EVENT: Event,
+        TIMING: Timing,
+        DEVICES: DeviceReport,
+        PARAMS: _Revision,
+    }
     with LogReader(path, partial=partial) as log:
-        for topic, message in log.read(kinds):
+        for topic, t_ns, message in log.timed(kinds):
             if topic == TICK:
                 inputs, outputs = message.inputs, message.outputs
                 estimate, reference, control = outputs.estimate, outputs.reference, outputs.control
@@ -251,11 +282,12 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
                     estimate.age_odometry,
                     estimate.age_autopilot,
                     estimate.age_servos,
+                    outputs.autopilot.engage == "offboard",
                 )
                 if autopilot is not None:
                     landed = autopilot.landed
             elif topic == TRUTH:
-                truth_rows.append(len(phases) - 1)
+                truth_ns.append(t_ns)
                 truths += (
                     *message.p_WB,
                     *message.q_WB,
@@ -274,18 +306,22 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
                 events.append(message)
             elif topic == TIMING:
                 timings.append(message)
+            elif topic == DEVICES:
+                devices.append(message)
             elif config is None:
                 config = message.config
         if not phases or config is None:
             raise LogError(f"{path}: holds no cycle; the run ended before its first tick")
         rows = np.array(ticks).reshape(len(phases), -1)
+        index = rows[:, 0].astype(np.int64)
+        punctuality = _by_tick(index, timings)
         return Run(
             path=path,
             info=log.info,
             config=config,
             config_yaml=log.config_yaml,
             complete=log.complete,
-            index=rows[:, 0].astype(np.int64),
+            index=index,
             t=rows[:, 1],
             phase=np.array(phases),
             p=rows[:, 2:5],
@@ -298,20 +334,44 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
             force_est=rows[:, 21],
             dispensing=rows[:, 22] > 0,
             payload=rows[:, 23] > 0,
-            stamps=dict(zip(DEVICES, rows[:, 24:27].T, strict=True)),
-            ages=dict(zip(DEVICES, rows[:, 27:30].T, strict=True)),
+            stamps=dict(zip(SOURCES, rows[:, 24:27].T, strict=True)),
+            ages=dict(zip(SOURCES, rows[:, 27:30].T, strict=True)),
             landed=landed,
-            truth=_truths(truths, truth_rows, len(phases), last, crashed) if last is not None else None,
-            late=np.array([timing.late for timing in timings]),
-            busy=np.array([timing.busy for timing in timings]),
-            events=events,
+            truth=_truths(truths, (np.array(truth_ns) - start_ns) * 1e-9, rows[:, 1], last, crashed)
+            if last is not None
+            else None,
+            offboard=rows[:, 30] > 0,
+            late=punctuality[:, 0],
+            busy=punctuality[:, 1],
+            sent=punctuality[:, 2],
+            devices=devices,
+            events=sorted(events, key=lambda event: event.t_ns),
             start_ns=start_ns,
         )
 
 
-def _truths(values: list[float], rows: list[int], n: int, last: _Truth, crashed: str) -> Truths:
-    table = np.full((n, 26), np.nan)
-    table[rows] = np.array(values).reshape(len(rows), -1)
+def _by_tick(index: NDArray[np.int64], timings: list[Timing]) -> Array:
+    """Lateness, duration and sending (s) of each tick, (n, 3); NaN where none was recorded."""
+    table = np.full((len(index), 3), np.nan)
+    at = np.array([timing.index for timing in timings], dtype=np.int64)
+    rows = np.minimum(np.searchsorted(index, at), len(index) - 1)
+    values = np.array([(timing.late, timing.busy, timing.sent) for timing in timings]).reshape(-1, 3)
+    found = index[rows] == at
+    table[rows[found]] = values[found]
+    return table
+
+
+def _truths(values: list[float], times: Array, t: Array, last: _Truth, crashed: str) -> Truths:
+    """Give each tick (at ``t``, s) the newest truth (at ``times``, s), and the peaks of all since the tick before."""
+    recorded = np.array(values).reshape(len(times), -1)
+    order = np.argsort(times, kind="stable")
+    recorded, times = recorded[order], times[order]
+    newest = np.searchsorted(times, t, side="right") - 1
+    known = (newest >= 0) & (t - times[newest] <= TRUTH_LASTS)
+    table = np.where(known[:, None], recorded[newest], np.nan)
+    for row, (since, until) in enumerate(itertools.pairwise(newest.tolist()), 1):
+        if until > since + 1:
+            table[row, 24] = recorded[since + 1 : until + 1, 24].max()
     return Truths(
         p=table[:, 0:3],
         rpy=euler(table[:, 3:7]),
@@ -323,6 +383,7 @@ def _truths(values: list[float], rows: list[int], n: int, last: _Truth, crashed:
         force=table[:, 23],
         peak=table[:, 24],
         slip=table[:, 25],
+        known=known,
         sleeve_on_pipe=last.sleeve_on_pipe,
         on_ground=last.on_ground,
         crashed=crashed,

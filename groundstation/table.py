@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from groundstation.metrics import PAPER
+from groundstation.punctuality import MISSED_ALLOWED
 
 #: What is asked of a good contact: hold within (N), touchdown peak (N), tip slip (m).
 HOLD, TOUCHDOWN, SLIP = 0.03, 3.0, 0.005
@@ -113,3 +114,6 @@ def _figures(metrics: dict[str, Any], force: float) -> Iterator[Figure]:
     if (late := metrics["timing"]["late"]) is not None:
         detail = f"p99 {1000 * late['p99']:.2f} ms, max {1000 * late['max']:.1f} ms"
         yield Figure("median lateness of the loop", f"{1000 * late['median']:.2f} ms", detail)
+    if (missed := metrics["timing"]["missed"]) is not None:
+        share = f"{100 * missed['share']:.3f} % of the ticks owed"
+        yield Figure("missed ticks", f"{missed['count']}", share, missed["share"] < MISSED_ALLOWED)

@@ -93,6 +93,11 @@ class LogReader:
         Raises:
             LogError: a chunk is damaged, or a message does not fit its type.
         """
+        for topic, _, message in self.timed(kinds):
+            yield topic, message
+
+    def timed(self, kinds: Mapping[str, Any]) -> Iterator[tuple[str, int, Any]]:
+        """As ``read``, with the log time (ns) of each message."""
         decoders = {topic: msgspec.json.Decoder(kind) for topic, kind in kinds.items()}
         words = msgspec.json.Decoder(NonFinite)
         pending: dict[str, NonFinite] = {}
@@ -103,9 +108,9 @@ class LogReader:
                 decoder = decoders.get(topic)
                 if decoder is not None:
                     if pending and (note := pending.pop(topic, None)) and note.sequence == message.sequence:
-                        yield topic, _restore(message, note.values, kinds[topic])
+                        yield topic, message.t_ns, _restore(message, note.values, kinds[topic])
                     else:
-                        yield topic, decoder.decode(message.data)
+                        yield topic, message.t_ns, decoder.decode(message.data)
                 elif topic == NONFINITE:
                     note = words.decode(message.data)
                     pending[note.topic] = note
@@ -124,7 +129,7 @@ class LogReader:
         return self.one(TICK, Tick)
 
     def truths(self) -> Iterator[Truth]:
-        """What was true at each cycle; nothing in a log of the real vehicle."""
+        """What was true, at each cycle of a simulated run; nothing in a log of the real vehicle."""
         return self.one(TRUTH, Truth)
 
     def events(self) -> Iterator[Event]:

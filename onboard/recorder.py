@@ -17,6 +17,7 @@ from onboard.core.types import Event, Tick
 from onboard.mcapfile import Channel, McapWriter
 from onboard.records import (
     CONFIG_NAME,
+    DEVICES,
     EVENT,
     INFO_NAME,
     KEYFRAME,
@@ -25,6 +26,7 @@ from onboard.records import (
     TICK,
     TIMING,
     TRUTH,
+    DeviceReport,
     Keyframe,
     NonFinite,
     Revision,
@@ -95,9 +97,9 @@ class Recorder:
         """Why the background writer gave up."""
         self._stream = path.open("wb")
         self._writer = McapWriter(self._stream, f"pipewright {info.version}")
-        self._channels: dict[str, Channel] = {}
         self._ticks = self._writer.channel(TICK, Tick)
-        self._truths = self._channels[TRUTH] = self._writer.channel(TRUTH, Truth)
+        self._truths = self._writer.channel(TRUTH, Truth)
+        self._channels: dict[str, Channel] = {TRUTH: self._truths}
         self._queue: queue.Queue[Callable[[], None] | None] | None = None
         self._writer.metadata(INFO_NAME, {key: str(value) for key, value in msgspec.to_builtins(info).items()})
         self._writer.attachment(CONFIG_NAME, "application/yaml", config_yaml.encode())
@@ -139,9 +141,17 @@ class Recorder:
         """Record an event from outside the core."""
         self._do(EVENT, event.t_ns, event, Event)
 
+    def truth(self, t_ns: int, truth: Truth) -> None:
+        """Record what was true at ``t_ns`` in a world that moves by itself, at its own times."""
+        self._do(TRUTH, t_ns, truth, Truth)
+
     def timing(self, timing: Timing) -> None:
         """Record how punctual a tick was (wall-clock runs)."""
         self._do(TIMING, timing.t_ns, timing, Timing)
+
+    def devices(self, report: DeviceReport) -> None:
+        """Record how the devices do (wall-clock runs)."""
+        self._do(DEVICES, report.t_ns, report, DeviceReport)
 
     def close(self) -> None:
         """Finish the file; safe to call twice. In the background mode waits a while for what is queued."""

@@ -1,8 +1,8 @@
 """What a log holds beside ticks, and on which topics.
 
 Topics: ``/tick`` (``Tick``), ``/truth`` (``Truth``, simulated worlds only), ``/event`` (``Event``), ``/keyframe``
-(the core's state before a tick), ``/params`` (a parameter revision), ``/timing`` (wall-clock runs only) and
-``/nonfinite`` (what JSON cannot say). Log times are the ticks' ``t_ns``.
+(the core's state before a tick), ``/params`` (a parameter revision), ``/timing`` and ``/devices`` (wall-clock runs
+only) and ``/nonfinite`` (what JSON cannot say). Log times are on the clock of the ticks' ``t_ns``.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ EVENT = "/event"
 KEYFRAME = "/keyframe"
 PARAMS = "/params"
 TIMING = "/timing"
+DEVICES = "/devices"
 NONFINITE = "/nonfinite"
 
 #: Name of the attachment that holds the configuration in force at the start.
@@ -66,9 +67,18 @@ class Timing(Struct, frozen=True, gc=False):
     late: float
     """Start of the tick against its schedule, s."""
     busy: float
-    """Time from the start of the tick to its end, s."""
+    """Time from the start of the tick to its last command, s."""
     sent: float
     """Time from the start of the tick until the autopilot's set-point had left, s."""
+
+
+class DeviceReport(Struct, frozen=True):
+    """How devices, drivers and processor do, once a second."""
+
+    t_ns: int
+    values: dict[str, float]
+    """By dotted name: ``autopilot.ATTITUDE_QUATERNION.rate`` (Hz), ``autopilot.setpoints`` (a count),
+    ``servos.cycle.p99`` (s), ``cpu.loop`` (share of one core), ... The first part is the device, or ``cpu``."""
 
 
 class NonFinite(Struct, frozen=True):
