@@ -228,7 +228,9 @@ class Px4:
     def __init__(self, settings: Px4Settings, clock: Callable[[], int] = monotonic_ns) -> None:
         """Raises DeviceError for settings without a thrust map."""
         if settings.thrust is None:
-            raise DeviceError("autopilot: no thrust map (thrust); identify one in a hover, or take ThrustMap.of(vehicle)")
+            raise DeviceError(
+                "autopilot: no thrust map (thrust); identify one in a hover, or take ThrustMap.of(vehicle)"
+            )
         self._settings = settings
         self._thrust = settings.thrust
         self._clock = clock

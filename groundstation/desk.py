@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import IO
 
 #: The first world on a machine compiles before it answers, s.
@@ -81,7 +82,8 @@ class Desk:
 
     def order(self, line: str) -> None:
         """A line for the world: a fault in YAML that begins now."""
-        assert self._world is not None and self._world.stdin is not None
+        assert self._world is not None
+        assert self._world.stdin is not None
         self._world.stdin.write(line + "\n")
         self._world.stdin.flush()
 
@@ -102,10 +104,8 @@ def start(arguments: Sequence[str], stdout: int | None = None, stderr: int | Non
 def end(child: subprocess.Popen[str]) -> None:
     """Let a child end in order; where it does not, make it."""
     if child.stdin is not None and not child.stdin.closed:
-        try:
+        with suppress(BrokenPipeError):
             child.stdin.close()
-        except BrokenPipeError:
-            pass
     for number in (None, signal.SIGTERM, signal.SIGKILL):
         if number is not None:
             child.send_signal(number)

@@ -55,9 +55,7 @@ class DeviceConfig(Struct, frozen=True, forbid_unknown_fields=True):
     autopilot: AutopilotConfig = AutopilotConfig()
     odometry: OdometryConfig = OdometryConfig()
     servos: ServosConfig = ServosConfig()
-    hitl: Annotated[bool, _note("a real autopilot may arm although other devices are not real: hardware in the loop")] = (
-        False
-    )
+    hitl: Annotated[bool, _note("a real autopilot may arm although other devices are not real")] = False
     world: Annotated[str, _note("host:port of the process that holds the world; empty: none is needed")] = ""
     simulator: Annotated[
         str,

@@ -212,5 +212,3 @@ def _mixed(kinds: dict[str, Kind], hitl: bool) -> tuple[str, ...]:
     if hitl or not unreal or kinds["autopilot"] is not Kind.REAL:
         return ()
     return (f"the autopilot is real, but {' and '.join(unreal)}: only with devices.hitl, propellers off",)
-
-

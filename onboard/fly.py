@@ -128,7 +128,12 @@ class _Flight:
                 self._say(event.text)
         for notice in self._devices.notices():
             self._tell(notice)
-        if not self._ready and outputs.phase is Phase.PREFLIGHT and outputs.estimate.valid and not outputs.verdict.reasons:
+        if (
+            not self._ready
+            and outputs.phase is Phase.PREFLIGHT
+            and outputs.estimate.valid
+            and not outputs.verdict.reasons
+        ):
             self._ready = True
             self._say("ready to fly: preflight passes")
         if self._devices.lost:

@@ -133,10 +133,6 @@ class Recorder:
         """Record the parameter set that is in force from tick ``index`` on."""
         self._do(PARAMS, t_ns, Revision(index, t_ns, revision, config), Revision[type(config)])  # type: ignore[misc]
 
-    def truth(self, t_ns: int, truth: Truth) -> None:
-        """Record what was true in the world at a time of its own."""
-        self._do(TRUTH, t_ns, truth, Truth)
-
     def event(self, event: Event) -> None:
         """Record an event from outside the core."""
         self._do(EVENT, event.t_ns, event, Event)

@@ -57,9 +57,7 @@ class WorldProcess:
                 self.endpoints["devices.autopilot.url"] = f"udpout://127.0.0.1:{stand_in.port}"
             if kinds["servos"] is Kind.EMULATED:
                 bus = devices.servos
-                emulator = emulate(
-                    bus.servos, world=world, link=servo_link, baud=bus.baud, faults=config.faults
-                )
+                emulator = emulate(bus.servos, world=world, link=servo_link, baud=bus.baud, faults=config.faults)
                 emulator.start()
                 self._cleanup.callback(emulator.stop)
                 self._faults["servos"] = emulator.faults
