@@ -72,4 +72,4 @@ async def fly(
     if recorder.dropped:
         say(f"{recorder.dropped} records were not written")
     if devices.slipped:
-        say(f"the simulated world fell behind the wall clock by {devices.slipped} periods of 4 ms")
+        say(f"the simulated world fell behind the wall clock by {devices.slipped:.2f} s")

@@ -42,7 +42,7 @@ class DeskDevices(DeviceSet):
         self.world = world_of(config)
         self._stand_in = Px4StandIn(self.world)
         url = f"udpout://127.0.0.1:{self._stand_in.port}"
-        self._px4 = Px4(Px4Settings(thrust=ThrustMap.of(config.vehicle), url=url))
+        self._px4 = Px4(Px4Settings(url=url), thrust=ThrustMap.of(config.vehicle))
         clock = self._stand_in.clock
         super().__init__(self._px4, MockOdometry(self.world, clock), MockServos(self.world, clock))
 
@@ -61,6 +61,6 @@ class DeskDevices(DeviceSet):
         return self._px4.notices()
 
     @property
-    def slipped(self) -> int:
-        """Periods that the world could not keep pace with the wall clock."""
+    def slipped(self) -> float:
+        """Seconds that the world could not keep pace with the wall clock."""
         return self._stand_in.slipped
