@@ -50,15 +50,17 @@ def _meta(unit: str, doc: str, low: float, high: float) -> Meta:
     return Meta(ge=low, le=high, description=doc, extra={"unit": unit, "in_flight": False})
 
 
+def _text(doc: str) -> Meta:
+    return Meta(description=doc, extra={"unit": "", "in_flight": False})
+
+
 class Px4Settings(Struct, frozen=True, forbid_unknown_fields=True):
     """Where PX4 is and what is asked of it."""
 
-    url: Annotated[
-        str,
-        Meta(description="MAVSDK URL: serial:///dev/ttyTHS1:921600, udpin://0.0.0.0:14540, ...; empty: the emulator's"),
-    ] = ""
+    url: Annotated[str, _text("MAVSDK URL: serial:///dev/ttyTHS1:921600, udpin://0.0.0.0:14540, ...")] = ""
     thrust: ThrustMap | None = None
-    """From newtons to set-points, as identified; None: what the vehicle's data imply."""
+    """The identified map; without one the constructor of ``Px4`` is given the one that the vehicle implies."""
+    parameters: Annotated[str, _text("file with the parameters that PX4 must hold (configs/px4); empty: none")] = ""
     timeout: Annotated[float, _meta("s", "for each stage of connecting", 0.1, 300.0)] = 10.0
     rate: Annotated[float, _meta("Hz", "asked for attitude and IMU", 10.0, 1000.0)] = 250.0
     stream_time: Annotated[float, _meta("s", "set-points run this long before offboard is asked for", 0.2, 10.0)] = 1.0
@@ -175,6 +177,7 @@ class _Ask(Struct, frozen=True, gc=False):
     params: tuple[float, ...]
 
 
+_WANTED_URL = "want for example serial:///dev/ttyTHS1:921600, udpin://0.0.0.0:14540 or tcpout://127.0.0.1:5760"
 _AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 _ONBOARD_COMPUTER = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _SYSTEM = 1
@@ -221,18 +224,19 @@ _RATE_TOLERANCE = 0.8
 class Px4:
     """AutopilotDevice on a PX4, real or emulated.
 
-    ``clock`` gives nanoseconds; samples are stamped with it when they arrive. Construct it anywhere; ``start`` must
-    run in the event loop in which ``stop`` will run. ``command`` and ``latest`` may be called from any one thread.
+    ``clock`` gives nanoseconds; samples are stamped with it when they arrive. ``thrust`` is the thrust map where the
+    settings hold none; with neither, ValueError. Construct it anywhere; ``start`` must run in the event loop in which
+    ``stop`` will run. ``command`` and ``latest`` may be called from any one thread.
     """
 
-    def __init__(self, settings: Px4Settings, clock: Callable[[], int] = monotonic_ns) -> None:
-        """Raises DeviceError for settings without a thrust map."""
-        if settings.thrust is None:
-            raise DeviceError(
-                "autopilot: no thrust map (thrust); identify one in a hover, or take ThrustMap.of(vehicle)"
-            )
+    def __init__(
+        self, settings: Px4Settings, clock: Callable[[], int] = monotonic_ns, thrust: ThrustMap | None = None
+    ) -> None:
+        known = settings.thrust or thrust
+        if known is None:
+            raise ValueError("autopilot: no thrust map; want thrust in its settings, or ThrustMap.of(vehicle)")
+        self._thrust = known
         self._settings = settings
-        self._thrust = settings.thrust
         self._clock = clock
         self._told = Notices()
         fast = settings.rate
@@ -292,6 +296,8 @@ class Px4:
 
     async def _start(self) -> None:
         url, timeout = self._settings.url, self._settings.timeout
+        if not url:
+            raise DeviceError(f"autopilot: no URL of PX4 in the settings; {_WANTED_URL}")
         loop = asyncio.get_running_loop()
         _hush()
         # The onboard computer shares the vehicle's system id, as PX4 expects of a companion.
@@ -302,8 +308,7 @@ class Px4:
             await asyncio.to_thread(self._hub.add_any_connection_with_handle, url)
         except Exception as error:
             raise DeviceError(
-                f"autopilot: cannot open {url} ({error}); want for example serial:///dev/ttyTHS1:921600, "
-                "udpin://0.0.0.0:14540 or tcpout://127.0.0.1:5760, and no other process on that port"
+                f"autopilot: cannot open {url} ({error}); {_WANTED_URL}, and no other process on that port"
             ) from error
 
         self._tell(Level.INFO, f"waiting for PX4's heartbeat on {url}")

@@ -54,8 +54,8 @@ def load_config(
     """Compose and check the configuration of a run.
 
     ``scenario`` is the name of a file in ``configs`` or ``configs/scenarios``, or a path to one; the ``config.yaml`` of
-    a former run is taken as it stands. ``law`` names a file in ``configs/controllers``; else the scenario says which, else ``tuned``.
-    Raises ConfigError with every error, each naming its file and line or its option.
+    a former run is taken as it stands. ``law`` names a file in ``configs/controllers``; else the scenario says which,
+    else ``tuned``. Raises ConfigError with every error, each naming its file and line or its option.
     """
     errors: list[str] = []
 

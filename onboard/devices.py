@@ -108,7 +108,7 @@ class FlightDevices(DeviceSet):
         if settings.kind is Kind.MOCK:
             assert self.world is not None
             return LinkedAutopilot(self.world)
-        self._px4 = Px4(replace(settings, thrust=settings.thrust or ThrustMap.of(config.vehicle)))
+        self._px4 = Px4(settings, thrust=ThrustMap.of(config.vehicle))
         return self._px4
 
     def _odometry_of(self, config: Config) -> OdometryDevice:

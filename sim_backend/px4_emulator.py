@@ -9,13 +9,11 @@ call ``step`` instead. Mock devices of the same world may stand beside it, with 
 from __future__ import annotations
 
 import struct
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from math import isfinite, nan
 from socket import AF_INET, SOCK_DGRAM, socket
-from threading import Event, Thread
 from typing import Any
 
 import msgspec
@@ -37,6 +35,7 @@ from sim_backend import layout as at
 from sim_backend.autopilot import SetPoint
 from sim_backend.mock_devices import MockAutopilot
 from sim_backend.motors import rated_voltage
+from sim_backend.pace import Pace
 from sim_backend.world import World
 
 Address = tuple[str, int]
@@ -46,7 +45,6 @@ _ACCEL_AND_GYRO = 0x3F
 _UNUSED_CELL = 65535
 _UNKNOWN_TEMPERATURE = 32767
 _MAX_DATAGRAM = 1400
-_LATE_STEPS = 25  # so many periods behind, the pace starts anew instead of catching up
 _TEXT_CHUNK = 50
 _FORCE = 21196.0
 _ACCEPTED, _REJECTED, _DENIED, _UNSUPPORTED, _FAILED = 0, 1, 2, 3, 4  # MAV_RESULT
@@ -126,10 +124,7 @@ class Px4StandIn:
         self.sent: Counter[str] = Counter()
         #: Newest message of each name received.
         self.newest: dict[str, Any] = {}
-        #: Periods that were given up because the machine could not keep pace.
-        self.slipped = 0
         self._face = MockAutopilot(world)
-        self._offset_ns = 0
         self._terminated = False
         self._told = world.snapshot
         self._state = self._face.latest()
@@ -182,8 +177,7 @@ class Px4StandIn:
             self._socket.close()
             raise DeviceError(f"PX4 stand-in: cannot listen on UDP {bind[0]}:{bind[1]} ({error.strerror})") from error
         self._socket.setblocking(False)
-        self._stopping = Event()
-        self._thread: Thread | None = None
+        self._pace = Pace(world, (self,))
 
     @property
     def port(self) -> int:
@@ -193,37 +187,22 @@ class Px4StandIn:
     # -- life cycle -----------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Step on the wall clock, in a thread of its own."""
-        self._stopping.clear()
-        self._thread = Thread(target=self._run, name="px4 stand-in", daemon=True)
-        self._thread.start()
+        """Move the world on the wall clock, in a thread of its own, with no other face beside this one."""
+        self._pace.start()
 
     def stop(self) -> None:
-        """End the thread and close the socket. Safe to call twice."""
-        self._stopping.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        """End the thread, if there is one, and close the socket. Safe to call twice."""
+        self._pace.stop()
         self._socket.close()
 
-    def _run(self) -> None:
-        period_ns = round(self.period * 1e9)
-        due = time.monotonic_ns()
-        while not self._stopping.is_set():
-            # A step ends at world time t + period and at wall time due, give or take its own cost.
-            self._offset_ns = due - self.world.snapshot.t_ns - period_ns
-            self.step()
-            due += period_ns
-            rest = due - time.monotonic_ns()
-            if rest > 0:
-                time.sleep(rest / 1e9)
-            elif -rest > _LATE_STEPS * period_ns:
-                self.slipped += -rest // period_ns
-                due = time.monotonic_ns()
+    @property
+    def slipped(self) -> float:
+        """Seconds since ``start`` that the world could not keep pace with the wall clock."""
+        return self._pace.slipped
 
     def clock(self, t_ns: int) -> int:
-        """World time as nanoseconds of the process's monotonic clock, for mock devices beside this one."""
-        return t_ns + self._offset_ns
+        """World time as nanoseconds of the machine's monotonic clock, for mock devices beside this one."""
+        return self._pace.clock(t_ns)
 
     def step(self) -> None:
         """Take what has arrived, advance the world by one period, publish what is due."""

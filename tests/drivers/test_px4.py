@@ -91,6 +91,16 @@ async def test_a_url_that_cannot_be_opened(url: str) -> None:
         await Px4(settings(url, timeout=0.3)).start()
 
 
+async def test_no_url() -> None:
+    with pytest.raises(DeviceError, match="no URL of PX4 in the settings; want for example serial"):
+        await Px4(settings("")).start()
+
+
+async def test_no_thrust_map() -> None:
+    with pytest.raises(ValueError, match=r"no thrust map; want thrust in its settings"):
+        Px4(Px4Settings(url="udpin://127.0.0.1:0"))
+
+
 async def test_a_taken_port() -> None:
     with socket(AF_INET, SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
