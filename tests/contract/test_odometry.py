@@ -21,7 +21,8 @@ from drivers.t265 import T265, T265Settings
 from drivers.tracking import Mount
 from drivers.vehicle import Vehicle
 from sim_backend.mock_devices import MockAutopilot, MockOdometry
-from sim_backend.t265_emulator import PERIOD, T265Emulator, circle
+from sim_backend.t265_emulator import T265Emulator, circle
+from sim_backend.tracker import PERIOD
 from sim_backend.world import World
 
 pytestmark = pytest.mark.asyncio

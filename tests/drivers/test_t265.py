@@ -21,7 +21,8 @@ from drivers.samples import Odometry
 from drivers.t265 import T265, T265Settings, Variances
 from drivers.vehicle import Vehicle
 from sim_backend.faults import Kind
-from sim_backend.t265_emulator import PERIOD, T265Emulator
+from sim_backend.t265_emulator import T265Emulator
+from sim_backend.tracker import PERIOD
 from sim_backend.world import World
 
 rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 cannot be imported here", exc_type=ImportError)

@@ -19,7 +19,8 @@ from sim_backend import layout as at
 from sim_backend import t265_emulator
 from sim_backend.faults import Fault, Kind
 from sim_backend.sensors import OdometryParams, SensorParams
-from sim_backend.t265_emulator import PERIOD, T265Emulator
+from sim_backend.t265_emulator import T265Emulator
+from sim_backend.tracker import PERIOD
 from sim_backend.world import World, WorldParams
 
 rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 cannot be imported here", exc_type=ImportError)

@@ -34,7 +34,9 @@ class Tracker:
         self._loop = asyncio.new_event_loop()
         starting = self._loop.create_task(self.driver.start())
         while not starting.done():
-            self.emulator._seen = None  # the world stands still meanwhile: measure it again until somebody listens
+            self.emulator.tracker._seen = (
+                None  # the world stands still meanwhile: measure it again until somebody listens
+            )
             self.latest()
         starting.result()
 
