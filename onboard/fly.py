@@ -93,6 +93,7 @@ class _Flight:
         self._watch, self._say = watch, say
         self._clock = WallClock()
         self._ready = False
+        self._over = False
 
     async def run(self, log: Path) -> None:
         """Tick until the flight is over."""
@@ -136,9 +137,12 @@ class _Flight:
         ):
             self._ready = True
             self._say("ready to fly: preflight passes")
-        if self._devices.lost:
+        if self._devices.lost or self._over:
             return False
         return self._errand is None or self._errand.goes_on(outputs, t)
+
+    def _end(self) -> None:
+        self._over = True
 
     def _order(self, line: str) -> None:
         """A request from standard input, in a thread of its own."""
