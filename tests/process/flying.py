@@ -32,7 +32,7 @@ BRISK = (
     "plan.advance_speed=0.015",
     "plan.arm_speed=0.25",
     "plan.needle_speed=0.1",
-    "plan.arc_max=0.1",
+    "plan.arc_max=0.6",
     "plan.retreat=0.2",
     "plan.descent_speed=0.3",
     "guidance.tare_settle=1",
@@ -105,13 +105,30 @@ class Flying:
         """How the world looks now."""
         return self.looks[-1]
 
+    def silent_since(self, message: str, silence: float = 0.3) -> Look:
+        """The look at which the last message of this name had come, once none has come for ``silence`` s."""
+        last = self.look()
+
+        def is_silent(look: Look) -> bool:
+            nonlocal last
+            if look.received.get(message, 0) != last.received.get(message, 0):
+                last = look
+            return look.t_ns - last.t_ns >= silence * 1e9
+
+        self.wait(f"no more {message}", is_silent)
+        return last
+
     def said(self, words: str) -> list[str]:
         """What the flight process has said on standard error with these words in it."""
         return [line for line in self._said if words in line]
 
-    def wait(self, what: str, happens: Callable[[Look], bool], patience: float = PATIENCE) -> Look:
-        """The first look at which something is so, from now on. Fails, saying ``what``, when it never comes."""
+    def wait(
+        self, what: str, happens: Callable[[Look], bool], patience: float = PATIENCE, since: Look | None = None
+    ) -> Look:
+        """The first look at which something is so, from now or ``since`` on. Fails with ``what`` when it never comes."""
         seen = len(self.looks) - 1
+        while since is not None and self.looks[seen].t_ns > since.t_ns:
+            seen -= 1
         until = time.monotonic() + patience
         while time.monotonic() < until:
             while seen < len(self.looks):
