@@ -7,14 +7,14 @@ manual is silent, or a servo is known to differ from it, the comment at the plac
 from __future__ import annotations
 
 import struct
-from math import exp, inf
+from math import inf
 from typing import NamedTuple
 
 from drivers import xc330 as x
 from drivers.xc330 import HardwareError, Item, Mode
+from sim_backend.dynamixel_mechanics import POSITIONED, Drive, Motion
 from sim_backend.dynamixel_wire import ALERT, Trouble
 
-_POSITIONED = (Mode.POSITION, Mode.EXTENDED_POSITION, Mode.CURRENT_BASED_POSITION)
 _GOALS = (x.GOAL_PWM, x.GOAL_CURRENT, x.GOAL_VELOCITY, x.GOAL_POSITION)
 _LIMITS = {x.GOAL_PWM: x.PWM_LIMIT, x.GOAL_CURRENT: x.CURRENT_LIMIT, x.GOAL_VELOCITY: x.VELOCITY_LIMIT}
 _MODES = tuple(int(mode) for mode in Mode)
@@ -24,27 +24,6 @@ _GAINS = (x.VELOCITY_I, x.VELOCITY_P, x.POSITION_D, x.POSITION_I, x.POSITION_P, 
 
 #: Realtime tick to present temperature, one behind the other.
 _PRESENT = struct.Struct("<HBBhhiiiiHB")
-
-
-class Drive(NamedTuple):
-    """What a servo's electronics ask of its motor. Angles in rad of the servo's own encoder."""
-
-    mode: Mode | None
-    """None: torque is off."""
-    goal: float = 0.0
-    """A, rad/s, rad or share of full PWM, by mode."""
-    limit: float = inf
-    """Largest current in a position mode, A."""
-
-
-class Motion(NamedTuple):
-    """What a servo's sensors see. Angles in rad of the servo's own encoder."""
-
-    position: float
-    velocity: float = 0.0
-    current: float = 0.0
-    voltage: float = 5.0
-    temperature: float = 30.0
 
 
 class _Settled(NamedTuple):
@@ -217,7 +196,7 @@ class Servo:
         mode = self.get(x.OPERATING_MODE)
         if mode == Mode.CURRENT:
             self._put(x.GOAL_CURRENT, 0)
-        elif mode in _POSITIONED:
+        elif mode in POSITIONED:
             self._hold(counts)
 
     def fail(self, error: HardwareError) -> None:
@@ -408,52 +387,3 @@ class Servo:
     def _hold(self, counts: int) -> None:
         self._put(x.GOAL_POSITION, counts)
         self._trajectory = float(counts)
-
-
-class FreeServos:
-    """Servos that carry nothing: first order towards the goal, no faster than the no-load speed.
-
-    A motor in current mode turns against viscous friction, so that its speed settles; ``start`` are angles in rad of
-    the encoders. A servo whose torque is off stays where it is.
-    """
-
-    NO_LOAD_SPEED = 8.48
-    """rad/s at 5 V (ROBOTIS e-manual)."""
-    STALL_CURRENT = 1.80
-    """A at 5 V (ROBOTIS e-manual)."""
-
-    def __init__(self, start: tuple[float, ...], time_constant: float = 0.04) -> None:
-        self.position = list(start)
-        self.velocity = [0.0] * len(start)
-        self.voltage = [5.0] * len(start)
-        self.temperature = [30.0] * len(start)
-        self._time_constant = time_constant
-        self._then: float | None = None
-
-    def exchange(self, now: float, drives: list[Drive]) -> list[Motion]:
-        """Move on to ``now`` under these drives."""
-        dt = now - self._then if self._then is not None else 0.0
-        self._then = now
-        return [self._move(k, drive, dt) for k, drive in enumerate(drives)]
-
-    def _move(self, k: int, drive: Drive, dt: float) -> Motion:
-        share = 1.0 - exp(-dt / self._time_constant)
-        before, velocity = self.position[k], 0.0
-        current = 0.0
-        if drive.mode in _POSITIONED:
-            error = drive.goal - before
-            most = self.NO_LOAD_SPEED * dt
-            self.position[k] += min(max(share * error, -most), most)
-            velocity = (self.position[k] - before) / dt if dt > 0.0 else self.velocity[k]
-            current = min(max(self.STALL_CURRENT * error / 0.1, -drive.limit), drive.limit)
-        elif drive.mode is not None:
-            aim = {
-                Mode.CURRENT: drive.goal / self.STALL_CURRENT * self.NO_LOAD_SPEED,
-                Mode.PWM: drive.goal * self.NO_LOAD_SPEED,
-                Mode.VELOCITY: drive.goal,
-            }[drive.mode]
-            velocity = self.velocity[k] + share * (aim - self.velocity[k])
-            self.position[k] += velocity * dt
-            current = drive.goal if drive.mode is Mode.CURRENT else 0.0
-        self.velocity[k] = velocity
-        return Motion(self.position[k], velocity, current, self.voltage[k], self.temperature[k])

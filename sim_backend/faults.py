@@ -1,12 +1,15 @@
 """Faults of devices, declared beforehand or injected on command: which device, what, when, how much.
 
 An emulator holds one ``Faults``, asks it at each step what is in force, and spoils its own bytes accordingly. Times are
-seconds of the world. A fault with a phase begins when that phase of the mission is entered for the first time.
+seconds of the world. A fault with a phase begins when that phase of the mission is entered for the first time. What
+strikes single samples or packets may be limited to a ``count`` of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from argparse import ArgumentParser, Namespace
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from enum import StrEnum
 from math import inf
 from pathlib import Path
@@ -29,6 +32,10 @@ class Kind(StrEnum):
     """Everything comes ``value`` seconds late."""
     CORRUPT = "corrupt"
     """A share ``value`` (0..1) of the packets is damaged."""
+    TRUNCATE = "truncate"
+    """A share ``value`` (0..1) of the packets breaks off in the middle."""
+    WRONG_ID = "wrong_id"
+    """A share ``value`` (0..1) of the packets names a wrong sender."""
     FREEZE = "freeze"
     """The same values over and over, with fresh times."""
     JUMP = "jump"
@@ -40,13 +47,17 @@ class Kind(StrEnum):
     CONFIDENCE = "confidence"
     """The device trusts itself this little: ``value``."""
     ERROR_BIT = "error_bit"
-    """The device reports the error bits ``value``."""
+    """The device reports the error bits ``value``; at a duration of 0, once."""
     SILENT = "silent"
     """Nothing comes, but the device is there."""
     UNPLUGGED = "unplugged"
     """The device is not there."""
     REBOOT = "reboot"
     """The device falls silent for the duration and forgets what it was told."""
+
+
+_SHARES = frozenset((Kind.DROP, Kind.CORRUPT, Kind.TRUNCATE, Kind.WRONG_ID))
+_COUNTED = _SHARES | {Kind.DELAY}
 
 
 def _text(doc: str) -> msgspec.Meta:
@@ -63,50 +74,104 @@ class Fault(Struct, frozen=True, forbid_unknown_fields=True):
     value: Annotated[float, knob("", "how much, in the unit of the kind", -1e9, 1e9)] = 0.0
     phase: Annotated[str, _text("phase of the mission")] | None = None
     part: Annotated[str, _text("servo or message that it strikes; empty: all")] = ""
+    count: Annotated[int, knob("1", "samples or packets that it strikes; none: all", 1, 1_000_000)] | None = None
 
 
 class Faults:
     """The faults of one device. One thread may ask while another injects or tells the phase."""
 
-    def __init__(self, device: str, kinds: Iterable[Kind], declared: Sequence[Fault] = ()) -> None:
-        """Take those of ``declared`` that strike this device. Raises ValueError for a kind that is not in ``kinds``."""
+    def __init__(
+        self, device: str, kinds: Iterable[Kind], declared: Sequence[Fault] = (), parts: Sequence[str] = ()
+    ) -> None:
+        """Take those of ``declared`` that strike this device; ``parts`` are the names it knows (none: any).
+
+        Raises ValueError for a kind that is not in ``kinds``, and as ``add`` does.
+        """
         self._device = device
         self._kinds = frozenset(kinds)
+        self._parts = frozenset(parts)
         self._faults: tuple[Fault, ...] = ()
         self._entered: dict[str, float] = {}
+        self._struck: Counter[Fault] = Counter()
+        self._begun: set[Fault] = set()
         for fault in declared:
             if fault.device == device:
                 self.add(fault)
 
     def add(self, fault: Fault) -> None:
-        """Declare one more."""
+        """Declare one more. Raises ValueError for one that this device cannot show."""
+        what = f"fault {fault.kind} of {fault.device}"
         if fault.device != self._device or fault.kind not in self._kinds:
-            raise ValueError(
-                f"fault {fault.kind} of {fault.device}: {self._device} can show {', '.join(sorted(self._kinds))}"
-            )
+            raise ValueError(f"{what}: {self._device} can show {', '.join(sorted(self._kinds))}")
+        if fault.part and self._parts and fault.part not in self._parts:
+            raise ValueError(f"{what}: no part {fault.part!r}; want one of {', '.join(sorted(self._parts))}")
+        if fault.kind in _SHARES and not 0.0 < fault.value <= 1.0:
+            raise ValueError(f"{what}: value {fault.value:g}; want a share, above 0 and up to 1")
+        if fault.kind is Kind.DELAY and fault.value <= 0.0:
+            raise ValueError(f"{what}: value {fault.value:g}; want seconds, above 0")
+        if fault.kind is Kind.ERROR_BIT and fault.value not in range(1, 256):
+            raise ValueError(f"{what}: value {fault.value:g}; want bits, 1 to 255")
+        if fault.count is not None and fault.kind not in _COUNTED:
+            raise ValueError(f"{what}: has no count; only {', '.join(sorted(_COUNTED & self._kinds))} have one")
         self._faults = (*self._faults, fault)
 
-    def inject(self, t: float, kind: Kind, duration: float | None = None, value: float = 0.0, part: str = "") -> None:
+    def inject(
+        self,
+        t: float,
+        kind: Kind,
+        duration: float | None = None,
+        value: float = 0.0,
+        part: str = "",
+        count: int | None = None,
+    ) -> None:
         """One that begins now, at world time t."""
-        self.add(Fault(self._device, kind, t, duration, value, None, part))
+        self.add(Fault(self._device, kind, t, duration, value, None, part, count))
 
-    def clear(self) -> None:
-        """The device is healthy from now on."""
-        self._faults = ()
+    def clear(self, kind: Kind | None = None) -> None:
+        """The device is healthy from now on, or at least free of faults of this kind."""
+        self._faults = tuple(fault for fault in self._faults if kind is not None and fault.kind is not kind)
 
     def enter(self, phase: str, t: float) -> None:
         """The mission is in this phase at world time t. May be told at every step."""
         self._entered.setdefault(phase, t)
 
+    def _begin(self, fault: Fault) -> float:
+        return fault.start + (0.0 if fault.phase is None else self._entered.get(fault.phase, inf))
+
+    def _in_force(self, t: float) -> Iterator[tuple[Fault, float]]:
+        """Each fault that is in force, and the world time of its beginning."""
+        for fault in self._faults:
+            begin = self._begin(fault)
+            end = inf if fault.duration is None else begin + fault.duration
+            if begin <= t < end and (fault.count is None or self._struck[fault] < fault.count):
+                yield fault, begin
+
     def active(self, t: float) -> tuple[Fault, ...]:
         """What is in force at world time t, each with ``start`` as world time."""
-        found = []
-        for fault in self._faults:
-            begin = fault.start + (0.0 if fault.phase is None else self._entered.get(fault.phase, inf))
-            end = inf if fault.duration is None else begin + fault.duration
-            if begin <= t < end:
-                found.append(fault if fault.phase is None else replace(fault, start=begin))
-        return tuple(found)
+        return tuple(
+            fault if fault.phase is None else replace(fault, start=begin) for fault, begin in self._in_force(t)
+        )
+
+    def begun(self, kind: Kind, t: float) -> tuple[Fault, ...]:
+        """The faults of this kind that have begun by t, each told once, however short it was."""
+        found = tuple(
+            fault
+            for fault in self._faults
+            if fault.kind is kind and fault not in self._begun and self._begin(fault) <= t
+        )
+        self._begun.update(found)
+        return found
+
+    def strike(self, kind: Kind, t: float, part: str = "", chance: float = 0.0) -> Fault | None:
+        """The fault of this kind that strikes this one sample or packet; it is counted.
+
+        ``chance``: a random number from 0 to 1, for the kinds whose value is a share.
+        """
+        for fault, _ in self._in_force(t):
+            if fault.kind is kind and fault.part in ("", part) and (kind not in _SHARES or chance < fault.value):
+                self._struck[fault] += 1
+                return fault
+        return None
 
     def find(self, kind: Kind, t: float, part: str = "") -> Fault | None:
         """The fault of this kind that is in force at t and strikes this part."""
@@ -141,3 +206,15 @@ def read_fault_file(path: Path) -> tuple[Fault, ...]:
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}; want a YAML list of faults") from error
     return read_faults(text, str(path))
+
+
+def add_fault_options(parser: ArgumentParser) -> None:
+    """The options with which an emulator that runs alone is told its faults."""
+    parser.add_argument("--fault", action="append", default=[], help="as YAML: '{device: servos, kind: silent}'")
+    parser.add_argument("--faults", type=Path, help="YAML file with a list of faults")
+
+
+def given_faults(given: Namespace) -> tuple[Fault, ...]:
+    """The faults of these options. Raises ValueError with what is wrong with them."""
+    faults = [fault for text in given.fault for fault in read_faults(text, f"--fault {text}")]
+    return (*faults, *(read_fault_file(given.faults) if given.faults else ()))

@@ -27,7 +27,7 @@ from drivers.samples import AutopilotCommand, Engage, Interface
 from drivers.t265 import T265, T265Settings
 from drivers.tracking import Mount
 from drivers.vehicle import Vehicle
-from sim_backend.faults import Fault, read_fault_file, read_faults
+from sim_backend.faults import Fault, add_fault_options, given_faults
 from sim_backend.mock_devices import Clock, MockAutopilot
 from sim_backend.software_camera import SoftwareCamera
 from sim_backend.tracker import PERIOD, Tracker
@@ -145,19 +145,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--duration", type=float, default=10.0, help="seconds")
     parser.add_argument("--offset", type=float, nargs=3, default=(0.0, 0.0, 0.0), help="of the camera in B, m")
     parser.add_argument("--rotation", type=float, nargs=3, default=(0.0, 0.0, 0.0), help="roll, pitch, yaw, deg")
-    parser.add_argument(
-        "--fault", action="append", default=[], help="as YAML: '{device: odometry, kind: nan, start: 3}'"
-    )
-    parser.add_argument("--faults", type=Path, help="YAML file with a list of faults")
+    add_fault_options(parser)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
     try:
-        faults = [fault for text in given.fault for fault in read_faults(text, f"--fault {text}")]
-        faults += read_fault_file(given.faults) if given.faults else ()
         vehicle = msgspec.convert(yaml.safe_load(given.vehicle.read_text(encoding="utf-8")), Vehicle)
         mount = Mount(tuple(given.offset), tuple(given.rotation))
         world = World(vehicle, seed=given.seed)
-        emulator = T265Emulator(world, mount, faults, given.seed)
+        emulator = T265Emulator(world, mount, given_faults(given), given.seed)
         settings = T265Settings(start=(0.0, 0.0, vehicle.base.gear_height), mount=mount, record=given.record)
         driver = T265(settings, emulator.find)
         asyncio.run(_fly(world, emulator, driver, given.duration))

@@ -49,7 +49,6 @@ class Tracker:
         self._waiting: deque[tuple[int, CameraPose]] = deque()
         self._origin: tuple[Vec3, Quat] | None = None
         self._moved = 0.0
-        self._jumped: set[Fault] = set()
 
     @property
     def gone(self) -> bool:
@@ -69,7 +68,7 @@ class Tracker:
         if sample is not None and (self._seen is None or sample.t_ns // _PERIOD_NS != self._seen.t_ns // _PERIOD_NS):
             self._creep(sample, t)
             self._seen = sample
-            delay = self.faults.find(Kind.DELAY, t)
+            delay = self.faults.strike(Kind.DELAY, t)
             later = round(delay.value * 1e9) if delay else 0
             self._waiting.append(
                 (now.t_ns + later, self._pose(sample, (now.x[at.RATE], now.x[at.RATE + 1], now.x[at.RATE + 2])))
@@ -90,12 +89,10 @@ class Tracker:
         self._dead = self._dead or self.gone
 
     def _creep(self, sample: Odometry, t: float) -> None:
-        for fault in self.faults.active(t):
-            if fault.kind is Kind.JUMP and fault not in self._jumped:
-                self._jumped.add(fault)
-                self._moved += fault.value
-            elif fault.kind is Kind.DRIFT and self._seen is not None:
-                self._moved += fault.value * (sample.t_ns - self._seen.t_ns) * 1e-9
+        self._moved += sum(fault.value for fault in self.faults.begun(Kind.JUMP, t))
+        if self._seen is not None:
+            creep = sum(fault.value for fault in self.faults.active(t) if fault.kind is Kind.DRIFT)
+            self._moved += creep * (sample.t_ns - self._seen.t_ns) * 1e-9
 
     def _pose(self, sample: Odometry, w_WB_B: Vec3) -> CameraPose:
         """The camera's pose and velocity in V, of the body's in W."""
@@ -125,8 +122,7 @@ class Tracker:
         faults = self.faults
         if self._dead or faults.find(Kind.SILENT, t):
             return None
-        drop = faults.find(Kind.DROP, t)
-        if drop is not None and self._random.random() < drop.value:
+        if faults.strike(Kind.DROP, t, chance=self._random.random()):
             return None
         if faults.find(Kind.FREEZE, t):
             self._frozen = self._frozen or pose

@@ -42,7 +42,9 @@ from drivers.protocols import DeviceError
 from drivers.samples import JointMode, ServoCommand, ServoState, Vec3
 from drivers.xc330 import HardwareError, Mode
 from sim_backend.dynamixel_emulator import DynamixelEmulator, emulate
-from sim_backend.dynamixel_servo import FreeServos, Servo
+from sim_backend.dynamixel_mechanics import FreeServos
+from sim_backend.dynamixel_servo import Servo
+from sim_backend.faults import Kind
 
 pytestmark = pytest.mark.asyncio
 
@@ -214,7 +216,8 @@ async def refusal(rig: Rig, settings: DynamixelSettings | None = None) -> str:
 
 async def test_names_the_servos_that_are_missing_and_the_ids_that_answer(tmp_path: Path) -> None:
     rig = Rig(tmp_path / "servos")
-    rig.servo(1).silent = rig.servo(4).silent = True
+    rig.emulator.inject(Kind.SILENT, part="theta_2")
+    rig.emulator.inject(Kind.SILENT, part="gripper")
     text = await refusal(rig)
     assert "no answer from theta_2 (id 7), gripper (id 12)" in text
     assert "ids that answer: 3, 4, 9" in text
@@ -228,8 +231,7 @@ async def test_finds_the_baud_rate_that_the_servos_have(tmp_path: Path) -> None:
 
 async def test_nobody_there(tmp_path: Path) -> None:
     rig = Rig(tmp_path / "servos")
-    for servo in rig.emulator.bus.servos:
-        servo.silent = True
+    rig.emulator.inject(Kind.SILENT)
     assert "is the 5 V supply on" in await refusal(rig, replace(rig.settings, reply_margin=0.003))
 
 
@@ -479,12 +481,12 @@ async def test_a_command_from_before_a_pause_is_not_sent_after_it(tmp_path: Path
 # -- faults ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("fault", ["drop", "corrupt", "truncate", "wrong_id"])
-async def test_a_spoilt_answer_costs_a_cycle_and_is_told_once(rig: Rig, fault: str) -> None:
+@pytest.mark.parametrize("fault", [Kind.DROP, Kind.CORRUPT, Kind.TRUNCATE, Kind.WRONG_ID])
+async def test_a_spoilt_answer_costs_a_cycle_and_is_told_once(rig: Rig, fault: Kind) -> None:
     await rig.engaged()
     for _ in range(3):
         before = sum(rig.driver.statistics().errors.values())
-        setattr(rig.emulator.bus, fault, 1)
+        rig.emulator.inject(fault, value=1.0, count=1)
         await rig.until(lambda: sum(rig.driver.statistics().errors.values()) > before, command)  # noqa: B023
         await rig.fresh(3, command)
     assert sum("a reading of the servos failed" in text for text in rig.texts()) <= 1
@@ -495,7 +497,7 @@ async def test_a_spoilt_answer_costs_a_cycle_and_is_told_once(rig: Rig, fault: s
 
 async def test_a_silent_servo_is_told_once_the_others_go_on_and_its_return_is_told(rig: Rig) -> None:
     await rig.until(lambda: rig.state().position == pytest.approx(GOALS, abs=0.01), command)
-    rig.servo(1).silent = True
+    rig.emulator.inject(Kind.SILENT, part="theta_2")
     await rig.until(lambda: rig.state().error[1] == HardwareError.SILENT, command)
     await rig.fresh(20, command)
     assert rig.state().position == pytest.approx(GOALS, abs=0.01)
@@ -503,22 +505,20 @@ async def test_a_silent_servo_is_told_once_the_others_go_on_and_its_return_is_to
     assert sum("theta_2 (id 7) does not answer any more" in text for text in rig.texts()) == 1
     new = (0.1, -0.3, 0.1, 0.9, -0.9)
     await rig.until(lambda: rig.state().position == pytest.approx(new, abs=0.01), lambda: command(position=new))
-    rig.servo(1).silent = False
+    rig.emulator.faults.clear()
     await rig.until(lambda: rig.state().error == (0,) * 5 and rig.state().torque_on, lambda: command(position=new))
     assert sum("theta_2 (id 7) answers again" in text for text in rig.texts()) == 1
 
 
 async def test_all_silent_is_one_sentence_and_no_samples(rig: Rig) -> None:
     await rig.engaged()
-    for servo in rig.emulator.bus.servos:
-        servo.silent = True
+    rig.emulator.inject(Kind.SILENT)
     await rig.until(lambda: rig.heard("no servo answers any more"), command)
     last = rig.state().t_ns
     await rig.ticks(30, command)
     assert rig.state().t_ns == last
     assert not rig.heard("the others go on")
-    for servo in rig.emulator.bus.servos:
-        servo.silent = False
+    rig.emulator.faults.clear()
     await rig.until(lambda: rig.state().t_ns > last and rig.state().error == (0,) * 5, command)
     await rig.engaged()
 
@@ -600,8 +600,8 @@ async def test_torque_switched_off_by_somebody_else_is_told_and_comes_back(rig: 
 
 async def test_late_answers_are_lived_with(rig: Rig) -> None:
     await rig.engaged()
-    rig.emulator.bus.delay, rig.emulator.bus.delayed = 0.03, 5
-    await rig.until(lambda: rig.emulator.bus.delayed == 0, command)
+    rig.emulator.inject(Kind.DELAY, value=0.03, count=5)
+    await rig.until(lambda: not rig.emulator.faults.active(rig.emulator.time), command)
     await rig.fresh(10, command)
     assert rig.state().position == pytest.approx(rig.state().position)
     await rig.until(lambda: rig.state().position == pytest.approx(GOALS, abs=0.01), command)
@@ -718,7 +718,7 @@ async def test_refusals_have_words(emulator: DynamixelEmulator) -> None:
         bus.write(3, xc330.PRESENT_POSITION, 2)
     with pytest.raises(NoAnswer):
         bus.read(99, xc330.TORQUE_ENABLE)
-    emulator.bus.corrupt = 1
+    emulator.inject(Kind.CORRUPT, value=1.0, count=1)
     with pytest.raises((Corrupt, NoAnswer)):
         bus.read(3, xc330.TORQUE_ENABLE)
     assert bus.read(3, xc330.MODEL_NUMBER) == xc330.MODEL
@@ -729,7 +729,7 @@ async def test_refusals_have_words(emulator: DynamixelEmulator) -> None:
 
 async def test_a_late_answer_is_not_taken_for_the_next_one(emulator: DynamixelEmulator) -> None:
     bus = Bus(Port(emulator.path, 1_000_000, 0.2))
-    emulator.bus.delay, emulator.bus.delayed = 0.21, 1
+    emulator.inject(Kind.DELAY, value=0.21, count=1)
     with pytest.raises(NoAnswer):
         bus.read(3, xc330.POSITION_P)
     # Two bytes as well, from the same servo.

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import termios
 import tty
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from time import monotonic
 
@@ -20,9 +20,12 @@ from drivers.dynamixel_settings import ServoSettings
 from drivers.vehicle import Vehicle
 from drivers.xc330 import HardwareError, Item, Mode
 from sim_backend import layout as at
-from sim_backend.dynamixel_emulator import DynamixelBus, DynamixelEmulator, WorldServos, emulate, order
-from sim_backend.dynamixel_servo import FreeServos, Servo
+from sim_backend.dynamixel_bus import DynamixelBus
+from sim_backend.dynamixel_emulator import DynamixelEmulator, emulate, order
+from sim_backend.dynamixel_mechanics import FreeServos, WorldServos
+from sim_backend.dynamixel_servo import Servo
 from sim_backend.dynamixel_wire import BROADCAST, Instruction, Packet, Parser, Trouble, crc_bytes, packet, status
+from sim_backend.faults import Fault, Kind
 from sim_backend.world import World
 
 SETTLED = 10.0  # s: everything has come to rest
@@ -40,6 +43,16 @@ class Wire:
     def ask(self, wire: bytes | str) -> bytes:
         (found,) = Parser().feed(bytes.fromhex(wire) if isinstance(wire, str) else wire)
         return self.bus.handle(found, self.now)[0]
+
+    def inject(
+        self,
+        kind: Kind,
+        duration: float | None = None,
+        value: float = 0.0,
+        part: str = "",
+        count: int | None = None,
+    ) -> None:
+        self.bus.troubles.faults.inject(self.bus.time(self.now), kind, duration, value, part, count)
 
     def wait(self, seconds: float) -> None:
         """Let time pass without a word."""
@@ -143,7 +156,7 @@ def test_reads_are_stuffed_but_fast_reads_are_not() -> None:
 
 def test_behind_a_silent_servo_there_is_silence() -> None:
     wire = Wire({1: 100, 2: 200, 3: 300})
-    wire.servos[2].silent = True
+    wire.inject(Kind.SILENT, part="theta_2")
     assert wire.ask(packet(BROADCAST, Instruction.SYNC_READ, b"\x84\x00\x04\x00\x01\x02\x03")) == status(
         1, 0, b"\x64\0\0\0"
     )
@@ -439,19 +452,61 @@ def test_faults_spoil_so_many_answers_and_no_more() -> None:
     wire = Wire({1: 100, 2: 100})
     ping = packet(1, Instruction.PING)
     sound = wire.ask(ping)
-    wire.bus.drop = 2
+    wire.inject(Kind.DROP, value=1.0, count=2)
     assert [wire.ask(ping), wire.ask(ping), wire.ask(ping)] == [b"", b"", sound]
-    wire.bus.corrupt = 1
+    wire.inject(Kind.CORRUPT, value=1.0, count=1)
     spoilt = wire.ask(ping)
     assert [each.sound for each in Parser().feed(spoilt)] == [False]
-    wire.bus.truncate = 1
+    wire.inject(Kind.TRUNCATE, value=1.0, count=1)
     assert wire.ask(ping) == sound[: len(sound) // 2]
-    wire.bus.wrong_id = 2
+    wire.inject(Kind.WRONG_ID, value=1.0, count=2)
     assert next(Parser().feed(wire.ask(ping))) == Packet(0x41, 0x55, sound[8:-2], True)
     fast = wire.ask(packet(BROADCAST, Instruction.FAST_SYNC_READ, b"\x84\x00\x04\x00\x01\x02"))
     assert fast[9] == 0x41
     assert crc_bytes(fast[:-2]) == fast[-2:]
     assert wire.ask(ping) == sound
+
+
+def test_an_error_stays_as_long_as_its_fault_and_is_gone_after_the_next_reboot() -> None:
+    wire = Wire({1: 100, 2: 100})
+    wire.inject(Kind.ERROR_BIT, 1.0, HardwareError.OVERLOAD, "theta_2")
+    wire.wait(0.1)
+    assert [servo.alert for servo in wire.servos.values()] == [0, 0x80]
+    for expected in (0x80, 0):
+        wire.ask(packet(2, Instruction.REBOOT))
+        wire.wait(0.5)
+        assert wire.servos[2].alert == expected
+        wire.wait(0.6)
+
+
+def test_what_lasts_for_no_time_happens_once() -> None:
+    wire = Wire({1: 100, 2: 100})
+    wire.inject(Kind.ERROR_BIT, 0.0, HardwareError.OVERHEATING)
+    wire.inject(Kind.REBOOT, 0.0, part="theta_2")
+    wire.servos[2].write(xc330.LED.address, b"\x01")
+    wire.now += 0.5
+    wire.bus.update(wire.now)
+    assert [servo.get(xc330.HARDWARE_ERROR) for servo in wire.servos.values()] == [4, 0]
+    assert wire.servos[2].get(xc330.LED) == 0
+    assert [servo.hears(wire.now) for servo in wire.servos.values()] == [True, False]
+    wire.wait(0.2)
+    assert wire.servos[2].hears(wire.now)
+
+
+def test_a_reboot_lasts_as_long_as_declared() -> None:
+    wire = Wire({1: 100, 2: 100})
+    wire.inject(Kind.REBOOT, 1.0, part="theta_1")
+    wire.wait(0.9)
+    assert wire.ask(packet(1, Instruction.PING)) == b""
+    wire.wait(0.2)
+    assert wire.ask(packet(1, Instruction.PING)) != b""
+
+
+def test_a_share_of_the_answers() -> None:
+    wire = Wire({1: 100})
+    wire.inject(Kind.DROP, value=0.3)
+    answered = sum(wire.ask(packet(1, Instruction.PING)) != b"" for _ in range(1000))
+    assert 640 < answered < 760
 
 
 # -- a simulated world ----------------------------------------------------------------------------------------------
@@ -466,10 +521,10 @@ MOUNTING = (
 
 
 class InWorld(Wire):
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, faults: Sequence[Fault] = ()) -> None:
         self.world = World(vehicle)
         self.servos = {mount.id: Servo(mount.id) for mount in MOUNTING}
-        self.bus = DynamixelBus(list(self.servos.values()), WorldServos(self.world, MOUNTING))
+        self.bus = DynamixelBus(list(self.servos.values()), WorldServos(self.world, MOUNTING), faults)
         self.now = 0.0
 
     def wait(self, seconds: float) -> None:
@@ -547,6 +602,17 @@ def test_one_servo_goes_limp_alone(vehicle: Vehicle) -> None:
     assert abs(wire.true()[2] - before[2]) > 0.05
     assert wire.world.truth().joint_torque[2] == 0.0
     assert wire.true()[:2] == pytest.approx(before[:2], abs=0.05)
+
+
+def test_declared_for_a_phase_in_the_world_s_time(vehicle: Vehicle) -> None:
+    wire = InWorld(vehicle, [Fault("servos", Kind.SILENT, 0.1, 0.2, phase="press", part="pump")])
+    wire.wait(0.5)
+    wire.bus.troubles.faults.enter("press", wire.world.time)
+    seen = []
+    for _ in range(4):
+        seen.append(wire.servos[13].silent)
+        wire.wait(0.1)
+    assert seen == [False, True, True, False]
 
 
 # -- the terminal ---------------------------------------------------------------------------------------------------
@@ -634,23 +700,35 @@ def test_unplugging_hangs_up_and_plugging_brings_the_link_back(emulator: Dynamix
 
 def test_an_answer_can_be_held_back(emulator: DynamixelEmulator) -> None:
     client = Client(emulator.path)
-    assert order(emulator, "delay 0.05 1") == ""
+    emulator.inject(Kind.DELAY, value=0.05, count=1)
     began = monotonic()
     assert client.ask(PING, 14) == PONG
     assert monotonic() - began >= 0.05
     client.close()
 
 
-def test_orders_in_words(emulator: DynamixelEmulator) -> None:
+def test_orders(emulator: DynamixelEmulator) -> None:
     client = Client(emulator.path)
-    for line in ("drop 1", "silent 2", "speak 2", "error 3 0x04", "overload 4", "reboot 5", "", "wrong-id 0"):
-        assert order(emulator, line) == ""
-    assert emulator.bus.drop == 1
-    assert [emulator.bus.servo(servo).alert for servo in (3, 4)] == [0x80, 0x80]
+    assert order(emulator, "{device: servos, kind: drop, value: 1, count: 1}") == ""
     assert client.ask(PING, 14, within=0.05) == b""
-    assert "no servo with id 77" in order(emulator, "silent 77")
-    assert "invalid literal" in order(emulator, "drop many")
-    assert "not understood" in order(emulator, "dance")
+    assert order(emulator, "{device: servos, kind: silent, part: theta_1}") == ""
+    assert client.ask(PING, 14, within=0.05) == b""
+    assert order(emulator, "clear") == order(emulator, "") == ""
+    assert client.ask(PING, 14) == PONG
+    assert "no part 'elbow'; want one of gripper, pump, theta_1" in order(
+        emulator, "{device: servos, kind: silent, part: elbow}"
+    )
+    assert "standard input: fault 1: " in order(emulator, "drop many")
+    client.close()
+
+
+def test_late_answers_come_one_behind_the_other(emulator: DynamixelEmulator) -> None:
+    """A delay is on the way, not in the servos: ten questions in a row take it once."""
+    emulator.inject(Kind.DELAY, value=0.2)
+    client = Client(emulator.path)
+    began = monotonic()
+    assert client.ask(PING * 10, 140) == PONG * 10
+    assert 0.2 <= monotonic() - began < 1.5
     client.close()
 
 
@@ -670,10 +748,10 @@ def test_alone_from_the_command_line(tmp_path: Path) -> None:
         assert process.stdout.readline() == f"{link}\n"
         client = Client(str(link), termios.B2000000)
         assert client.ask(PING, 14) == PONG
-        _, complaints = process.communicate("silent 99\nquit\n", timeout=10)
+        _, complaints = process.communicate("{device: odometry, kind: nan}\nquit\n", timeout=10)
         client.close()
     assert process.returncode == 0
-    assert "no servo with id 99" in complaints
+    assert "fault nan of odometry: servos can show corrupt, delay" in complaints
     assert not link.exists()
 
 

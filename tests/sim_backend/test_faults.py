@@ -50,6 +50,43 @@ def test_injected_and_cleared_on_command() -> None:
     assert kinds(faults, 6.0) == []
 
 
+def test_a_count_strikes_so_many_and_no_more() -> None:
+    faults = Faults("odometry", (Kind.DROP, Kind.DELAY))
+    faults.inject(0.0, Kind.DROP, value=0.5, count=2)
+    struck = [faults.strike(Kind.DROP, 1.0, chance=chance) is not None for chance in (0.6, 0.4, 0.5, 0.1, 0.1)]
+    assert struck == [False, True, False, True, False]
+    assert kinds(faults, 1.0) == []
+
+
+def test_a_beginning_is_told_once_however_short() -> None:
+    fault = Fault("odometry", Kind.JUMP, 1.0, 0.0)
+    faults = Faults("odometry", KINDS, [fault])
+    assert [faults.begun(Kind.JUMP, t) for t in (0.9, 1.1, 1.2)] == [(), (fault,), ()]
+
+
+def test_cleared_by_kind() -> None:
+    faults = Faults("odometry", KINDS)
+    faults.inject(0.0, Kind.NAN)
+    faults.inject(0.0, Kind.SILENT)
+    faults.clear(Kind.NAN)
+    assert kinds(faults, 0.0) == [Kind.SILENT]
+
+
+@pytest.mark.parametrize(
+    ("fault", "complaint"),
+    [
+        (Fault("servos", Kind.DROP, value=1.5), "value 1.5; want a share, above 0 and up to 1"),
+        (Fault("servos", Kind.DELAY), "value 0; want seconds, above 0"),
+        (Fault("servos", Kind.ERROR_BIT, value=0.5), "value 0.5; want bits, 1 to 255"),
+        (Fault("servos", Kind.SILENT, count=3), "has no count; only delay, drop have one"),
+        (Fault("servos", Kind.SILENT, part="elbow"), "no part 'elbow'; want one of pump, theta_1"),
+    ],
+)
+def test_what_cannot_be(fault: Fault, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        Faults("servos", (Kind.DROP, Kind.DELAY, Kind.ERROR_BIT, Kind.SILENT), [fault], ("theta_1", "pump"))
+
+
 def test_find_by_kind_and_part() -> None:
     faults = Faults("servos", (Kind.SILENT, Kind.ERROR_BIT))
     faults.inject(0.0, Kind.ERROR_BIT, value=32.0, part="theta_2")
