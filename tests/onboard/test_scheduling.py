@@ -21,7 +21,6 @@ from onboard.layers import ConfigError
 from onboard.params import load
 from onboard.scheduling import COLLECT_EVERY, Collector, ProcessParams, ask, event_loop
 
-
 PR_GET_TIMERSLACK = 30
 
 
