@@ -13,6 +13,7 @@ from drivers.mailbox import Level, Notice
 from onboard import attended
 from onboard.clock import WallClock
 from onboard.config import Config, dump_config
+from onboard.core.params import Params
 from onboard.core.step import State
 from onboard.core.types import Event, Outputs, Phase, Request, Severity, Tick
 from onboard.devices import FlightDevices
@@ -54,6 +55,9 @@ class _Sink:
 
     def timing(self, timing: Timing) -> None:
         self._recorder.timing(timing)
+
+    def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None:
+        self._recorder.revision(index, t_ns, revision, config)
 
 
 async def fly(

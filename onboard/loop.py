@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from drivers.protocols import AutopilotDevice, OdometryDevice, ServoDevice
 from onboard.clock import Clock
-from onboard.core.derived import derive
+from onboard.core.derived import Derived, adopt, derive
+from onboard.core.mission import GROUND
 from onboard.core.params import Params
 from onboard.core.step import State, initial_state, step
 from onboard.core.types import Inputs, Outputs, Request, Tick
@@ -43,6 +44,15 @@ class Sink(Protocol):
     def timing(self, timing: Timing) -> None:
         """Take the punctuality of one tick."""
 
+    def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None:
+        """Take the parameter set that is in force from the tick of this index on."""
+
+
+class _Reload(NamedTuple):
+    derived: Derived
+    grounded: bool
+    done: Callable[[int | None], None]
+
 
 class Loop:
     """Runs the core at ``rate_hz`` on a clock.
@@ -58,24 +68,41 @@ class Loop:
         self._period_ns = round(1e9 / rate_hz)
         self._timed = timed
         self._requests: deque[Request] = deque()
+        self._reloads: deque[_Reload] = deque()
         self._state = initial_state(params)
         self.revision = 0
         self.outputs: Outputs | None = None
+
+    @property
+    def params(self) -> Params:
+        """The parameter set in force."""
+        return self._params
 
     def request(self, request: Request) -> None:
         """Ask something of the mission; taken one a tick, in order."""
         self._requests.append(request)
 
+    def reload(self, derived: Derived, *, grounded: bool, done: Callable[[int | None], None]) -> None:
+        """Put another parameter set into force between two ticks; from any thread.
+
+        derived: the set, with what follows from it, made beforehand so that no tick has to wait for it.
+        grounded: it may be put into force only in PREFLIGHT and STOPPED.
+        done: called by the loop with the new revision, or with None when the vehicle was not on the ground.
+        """
+        self._reloads.append(_Reload(derived, grounded, done))
+
     async def run(self, on_tick: Callable[[Outputs], bool]) -> None:
         """Tick until ``on_tick`` returns False. It is called after each tick's commands are out."""
         clock, devices, sink = self._clock, self._devices, self._sink
         period = self._period_ns
-        state, params = self._state, self._params
+        state = self._state
         index = 0
         due = last = clock.now_ns()
         keyframe_due = due
         while True:
             now = clock.now_ns()
+            while self._reloads:
+                self._put_into_force(self._reloads.popleft(), index, now)
             inputs = Inputs(
                 now,
                 (now - last) * 1e-9 if index else period * 1e-9,
@@ -86,7 +113,7 @@ class Loop:
                 devices.obstacles(),
             )
             before = state
-            state, outputs = step(state, inputs, params, inputs.dt)
+            state, outputs = step(state, inputs, self._params, inputs.dt)
             devices.autopilot.command(outputs.autopilot)
             sent = clock.now_ns()
             devices.servos.command(outputs.servos)
@@ -107,3 +134,12 @@ class Loop:
             if self._timed and clock.now_ns() > due + 10 * period:
                 due = clock.now_ns()  # after a long stall, go on from here instead of catching up in a burst
             await clock.sleep_until(due)
+
+    def _put_into_force(self, reload: _Reload, index: int, now: int) -> None:
+        if reload.grounded and self._state.mission.phase not in GROUND:
+            reload.done(None)
+            return
+        self._params = adopt(reload.derived).params
+        self.revision += 1
+        self._sink.revision(index, now, self.revision, self._params)
+        reload.done(self.revision)

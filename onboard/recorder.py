@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import queue
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -39,6 +40,8 @@ _CHUNK_NS = 250_000_000
 _CHUNK_BYTES = 1 << 20
 _QUEUE = 2500
 _PATIENCE = 10.0
+#: A disk that takes nothing for this long is told of, s.
+_STUCK = 0.5
 
 
 def nonfinite(value: object) -> dict[str, str]:
@@ -64,7 +67,8 @@ class Recorder:
     """Writes ``log.mcap``. Use as a context manager; leaving it finishes the file.
 
     With ``background`` the encoding and writing happen in a thread of their own: no call ever waits, a full or slow
-    disk loses records instead (``dropped``, ``error``). Without it, calls write at once and errors are raised.
+    disk loses records instead (``trouble`` tells of it in flight; ``dropped`` and ``error`` are the sum of it). Without
+    it, calls write at once and errors are raised.
     A killed process loses at most the last quarter of a second.
 
     Args:
@@ -95,6 +99,9 @@ class Recorder:
         """Records lost to a full queue or a failed disk (background only)."""
         self.error: Exception | None = None
         """Why the background writer gave up."""
+        self._since = 0.0
+        """When the writer began with what it is writing, s; 0 while it waits for more."""
+        self._told: set[str] = set()
         self._stream = path.open("wb")
         self._writer = McapWriter(self._stream, f"pipewright {info.version}")
         self._ticks = self._writer.channel(TICK, Tick)
@@ -149,6 +156,26 @@ class Recorder:
         """Record how the devices do (wall-clock runs)."""
         self._do(DEVICES, report.t_ns, report, DeviceReport)
 
+    def trouble(self) -> str:
+        """What has gone wrong with the log in the background: each kind once, as soon as it is seen; else empty.
+
+        Looked at in every tick, so that it is told in flight. Never waits.
+        """
+        since = self._since
+        if self.error is not None:
+            return self._once("error", f"The log has ended: {self.error}. The flight goes on without a record.")
+        if self.dropped:
+            return self._once("dropped", "The disk is too slow for the log: records are being lost.")
+        if since and time.monotonic() - since > _STUCK:
+            return self._once("stuck", "The disk does not take the log: records will be lost if this stays.")
+        return ""
+
+    def _once(self, kind: str, text: str) -> str:
+        if kind in self._told:
+            return ""
+        self._told.add(kind)
+        return text
+
     def close(self) -> None:
         """Finish the file; safe to call twice. In the background mode waits a while for what is queued."""
         if self._stream.closed:
@@ -185,11 +212,13 @@ class Recorder:
                 if self.error is not None:
                     self.dropped += 1
                     continue
+                self._since = time.monotonic()
                 try:
                     job()
                 except Exception as error:  # a flight goes on without its log
                     self.error = error
                     self.dropped += 1
+                self._since = 0.0
             with self._stream:
                 if self.error is None:
                     self._writer.finish()

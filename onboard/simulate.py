@@ -8,6 +8,7 @@ from pathlib import Path
 
 from onboard.clock import VirtualClock
 from onboard.config import Config, dump_config
+from onboard.core.params import Params
 from onboard.core.step import State
 from onboard.core.types import Outputs, Tick
 from onboard.devices import mock_devices, world_of
@@ -39,6 +40,10 @@ class TruthSink:
     def timing(self, timing: Timing) -> None:
         """Take the punctuality of one tick."""
         self._recorder.timing(timing)
+
+    def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None:
+        """Take the parameter set that is in force from the tick of this index on."""
+        self._recorder.revision(index, t_ns, revision, config)
 
 
 def run_info(config: Config, *, realtime: bool = False, started: str = "") -> RunInfo:

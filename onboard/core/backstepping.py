@@ -35,15 +35,17 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     beta_z: Annotated[float, spec("N/m", 0.0, 50.0, "adaptation gain, vertical")] = 4.0
     bound: Annotated[float, spec("N", 0.0, 20.0, "largest adapted force per axis")] = 5.0
     leak: Annotated[float, spec("1/s", 0.0, 5.0, "rate at which the adapted force is forgotten")] = 0.0
-    compliant: Annotated[bool, note("replace stiffness and damping along the contact normal while pressing")] = True
+    compliant: Annotated[
+        bool, note("replace stiffness and damping along the contact normal while pressing", in_flight=False)
+    ] = True
     freeze_in_contact: Annotated[bool, note("no adaptation along the contact normal near the pipe")] = True
-    contact_stiffness: Annotated[float, spec("1/s^2", 0.0, 20.0, "stiffness per mass along the normal in contact")] = (
-        0.3
-    )
+    contact_stiffness: Annotated[
+        float, spec("1/s^2", 0.0, 20.0, "stiffness per mass along the normal in contact", in_flight=False)
+    ] = 0.3
     contact_damping: Annotated[float, spec("1/s", 0.0, 20.0, "damping per mass along the normal in contact")] = 1.2
-    feed_forward: Annotated[float, spec("1", 0.0, 1.5, "share of the desired contact force added along the normal")] = (
-        1.0
-    )
+    feed_forward: Annotated[
+        float, spec("1", 0.0, 1.5, "share of the desired contact force added along the normal", in_flight=False)
+    ] = 1.0
 
 
 class State(Struct, frozen=True, gc=False):

@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 
 
 class Derived:
-    """Model and site of one parameter set. Raises ``plan.InfeasibleError`` when the pipe cannot be repaired."""
+    """Model and site of one parameter set. Raises ``plan.InfeasibleError`` when the pipe cannot be repaired.
+
+    Takes milliseconds to make: not something for a tick.
+    """
 
     def __init__(self, params: Params) -> None:
         self.params = params
@@ -25,10 +28,14 @@ class Derived:
         """Stiffness of the translation law along the contact normal while pressing, N/m."""
 
 
-def check_mission(params: Params) -> None:
-    """Raise ``plan.InfeasibleError`` when the mission cannot be flown; to be asked before a flight, not in it."""
-    site = derive(params).site
-    plan.check_fence(site, params.pipe, params.plan, params.safety.fence_low, params.safety.fence_high)
+def check_mission(params: Params) -> Derived:
+    """What follows from ``params``. Raises ``plan.InfeasibleError`` when the mission cannot be flown.
+
+    Touches nothing that is in force, so that it may be asked while another set is being flown, in any thread.
+    """
+    derived = Derived(params)
+    plan.check_fence(derived.site, params.pipe, params.plan, params.safety.fence_low, params.safety.fence_high)
+    return derived
 
 
 _last: Derived | None = None
@@ -36,7 +43,13 @@ _last: Derived | None = None
 
 def derive(params: Params) -> Derived:
     """``Derived`` of ``params``, remembered for as long as the same set is in force."""
-    global _last
     if _last is None or _last.params is not params:
-        _last = Derived(params)
+        return adopt(Derived(params))
     return _last
+
+
+def adopt(derived: Derived) -> Derived:
+    """Remember what was made beforehand: ``derive`` of its parameters costs nothing from now on."""
+    global _last
+    _last = derived
+    return derived

@@ -16,10 +16,14 @@ from onboard.core.spec import spec
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
     """Shape of the profile."""
 
-    bias: Annotated[float, spec("N", 0.05, 2.0, "force that keeps contact before and after the ramps")] = 0.3
-    settle: Annotated[float, spec("s", 0.1, 20.0, "time from the trigger to the bias")] = 1.0
-    bias_hold: Annotated[float, spec("s", 0.0, 20.0, "time at the bias before the ramp and after it")] = 1.0
-    ramp: Annotated[float, spec("s", 0.5, 60.0, "duration of each quintic ramp")] = 6.0
+    bias: Annotated[
+        float, spec("N", 0.05, 2.0, "force that keeps contact before and after the ramps", in_flight=False)
+    ] = 0.3
+    settle: Annotated[float, spec("s", 0.1, 20.0, "time from the trigger to the bias", in_flight=False)] = 1.0
+    bias_hold: Annotated[
+        float, spec("s", 0.0, 20.0, "time at the bias before the ramp and after it", in_flight=False)
+    ] = 1.0
+    ramp: Annotated[float, spec("s", 0.5, 60.0, "duration of each quintic ramp", in_flight=False)] = 6.0
     lead: Annotated[float, spec("s", 0.0, 1.0, "lead of the force fed forward, for the attitude's lag")] = 0.11
 
 

@@ -51,13 +51,19 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     settle_yaw: Annotated[float, spec("rad", 0.005, 0.5, "tolerance of the yaw")] = 0.035
     tare_settle: Annotated[float, spec("s", 0.0, 20.0, "rest before the tare")] = 2.0
     tare_time: Annotated[float, spec("s", 0.5, 30.0, "time the tare is averaged over")] = 3.0
-    force_down: Annotated[float, spec("s", 0.2, 10.0, "time in which the force is taken back before a retreat")] = 1.0
-    pull_back: Annotated[float, spec("N", 0.0, 2.0, "pull with which the tip comes free, after the force is back")] = (
-        0.3
-    )
+    force_down: Annotated[
+        float, spec("s", 0.2, 10.0, "time in which the force is taken back before a retreat", in_flight=False)
+    ] = 1.0
+    pull_back: Annotated[
+        float, spec("N", 0.0, 2.0, "pull with which the tip comes free, after the force is back", in_flight=False)
+    ] = 0.3
     release_hold: Annotated[float, spec("s", 0.0, 10.0, "time at the bias after the gripper has opened")] = 1.0
-    gripper_closed: Annotated[float, spec("rad", -3.14, 3.14, "gripper servo angle that holds the sleeve")] = 0.0
-    gripper_open: Annotated[float, spec("rad", -3.14, 3.14, "gripper servo angle that lets it go")] = 1.0
+    gripper_closed: Annotated[
+        float, spec("rad", -3.14, 3.14, "gripper servo angle that holds the sleeve", in_flight=False)
+    ] = 0.0
+    gripper_open: Annotated[float, spec("rad", -3.14, 3.14, "gripper servo angle that lets it go", in_flight=False)] = (
+        1.0
+    )
     stop_acceleration: Annotated[float, spec("m/s^2", 0.1, 3.0, "mean deceleration of a broken-off motion")] = 0.5
 
 

@@ -24,32 +24,54 @@ Eight = tuple[float, float, float, float, float, float, float, float]
 
 
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
-    """Geometry and speeds of the mission's motion."""
+    """Geometry and speeds of the mission's motion.
 
-    takeoff_height: Annotated[float, spec("m", 0.4, 10.0, "height above the start at the end of takeoff")] = 1.0
-    standoff: Annotated[float, spec("m", 0.7, 5.0, "base to crack before the approach to the pipe")] = 1.0
-    clearance: Annotated[float, spec("m", 0.5, 3.0, "no route passes the pipe's axis closer than this")] = 0.85
-    gap: Annotated[float, spec("m", 0.02, 0.3, "sleeve to crack before the advance")] = 0.05
-    retreat: Annotated[float, spec("m", 0.1, 2.0, "way back along the contact normal")] = 0.40
-    press_reach: Annotated[float, spec("m", 0.1, 0.39, "wrist ahead of the mount while pressing")] = 0.30
-    needle_reach: Annotated[float, spec("m", 0.1, 0.39, "wrist ahead of the mount at the middle of the arc")] = 0.25
-    needle_gap: Annotated[float, spec("m", 0.0, 0.02, "needle tip above the pipe's surface")] = 0.003
-    needle_clear: Annotated[float, spec("m", 0.005, 0.1, "needle lifted off the surface before and after the arc")] = (
-        0.03
+    Where the vehicle goes is settled on the ground, since a leg may be under way by one geometry and the arm follow
+    another; how fast may be changed in flight, and holds from the next phase on.
+    """
+
+    takeoff_height: Annotated[
+        float, spec("m", 0.4, 10.0, "height above the start at the end of takeoff", in_flight=False)
+    ] = 1.0
+    standoff: Annotated[
+        float, spec("m", 0.7, 5.0, "base to crack before the approach to the pipe", in_flight=False)
+    ] = 1.0
+    clearance: Annotated[
+        float, spec("m", 0.5, 3.0, "no route passes the pipe's axis closer than this", in_flight=False)
+    ] = 0.85
+    gap: Annotated[float, spec("m", 0.02, 0.3, "sleeve to crack before the advance", in_flight=False)] = 0.05
+    retreat: Annotated[float, spec("m", 0.1, 2.0, "way back along the contact normal", in_flight=False)] = 0.40
+    press_reach: Annotated[float, spec("m", 0.1, 0.39, "wrist ahead of the mount while pressing", in_flight=False)] = (
+        0.30
     )
-    arc_max: Annotated[float, spec("rad", 0.1, 2.5, "half the arc to dispense on, when reachable")] = 1.3
-    link_clear: Annotated[float, spec("m", 0.0, 0.2, "least distance of link 2 from the pipe's surface")] = 0.02
+    needle_reach: Annotated[
+        float, spec("m", 0.1, 0.39, "wrist ahead of the mount at the middle of the arc", in_flight=False)
+    ] = 0.25
+    needle_gap: Annotated[float, spec("m", 0.0, 0.02, "needle tip above the pipe's surface", in_flight=False)] = 0.003
+    needle_clear: Annotated[
+        float, spec("m", 0.005, 0.1, "needle lifted off the surface before and after the arc", in_flight=False)
+    ] = 0.03
+    arc_max: Annotated[float, spec("rad", 0.1, 2.5, "half the arc to dispense on, when reachable", in_flight=False)] = (
+        1.3
+    )
+    link_clear: Annotated[
+        float, spec("m", 0.0, 0.2, "least distance of link 2 from the pipe's surface", in_flight=False)
+    ] = 0.02
     fold: tuple[
-        Annotated[float, spec("m", -0.4, 0.4, "folded wrist, forward")],
-        Annotated[float, spec("m", -0.4, 0.4, "folded wrist, up")],
+        Annotated[float, spec("m", -0.4, 0.4, "folded wrist, forward", in_flight=False)],
+        Annotated[float, spec("m", -0.4, 0.4, "folded wrist, up", in_flight=False)],
     ] = (0.0, -0.14)
-    pump_ratio: Annotated[float, spec("rad/m", 0.0, 200.0, "pump servo angle per length of adhesive")] = 12.0
+    pump_ratio: Annotated[
+        float, spec("rad/m", 0.0, 200.0, "pump servo angle per length of adhesive", in_flight=False)
+    ] = 12.0
     speed: Annotated[float, spec("m/s", 0.05, 2.0, "peak speed of the base")] = 0.40
     acceleration: Annotated[float, spec("m/s^2", 0.05, 3.0, "peak acceleration of the base")] = 0.35
     jerk: Annotated[float, spec("m/s^3", 0.05, 10.0, "peak jerk of the base")] = 0.7
     near_speed: Annotated[float, spec("m/s", 0.01, 0.5, "peak speed beside the pipe")] = 0.12
     advance_speed: Annotated[float, spec("m/s", 0.002, 0.05, "speed towards contact")] = 0.010
-    overtravel: Annotated[float, spec("m", 0.01, 0.3, "advance past the crack before giving up")] = 0.08
+    overtravel: Annotated[float, spec("m", 0.01, 0.3, "advance past the crack before giving up", in_flight=False)] = (
+        0.08
+    )
     descent_speed: Annotated[float, spec("m/s", 0.05, 1.0, "last part of the landing")] = 0.20
     yaw_rate: Annotated[float, spec("rad/s", 0.05, 2.0, "peak yaw rate")] = 0.5
     arm_speed: Annotated[float, spec("m/s", 0.01, 0.5, "peak speed of the wrist")] = 0.12

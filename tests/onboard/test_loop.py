@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from drivers.samples import AutopilotCommand, Engage, ServoCommand
 from onboard.clock import VirtualClock
 from onboard.config import Config, load_config
+from onboard.core.params import Params
 from onboard.core.plan import InfeasibleError
 from onboard.core.step import State, initial_state, step
 from onboard.core.types import Inputs, Outputs, Phase, Request, Tick
@@ -30,6 +31,7 @@ class Kept:
         self.ticks: list[Tick] = []
         self.keyframes: list[tuple[int, int, State]] = []
         self.timings: list[Timing] = []
+        self.revisions: list[tuple[int, int, int, Params]] = []
 
     def tick(self, tick: Tick) -> None:
         self.ticks.append(tick)
@@ -39,6 +41,9 @@ class Kept:
 
     def timing(self, timing: Timing) -> None:
         self.timings.append(timing)
+
+    def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None:
+        self.revisions.append((index, t_ns, revision, config))
 
 
 class LateClock:

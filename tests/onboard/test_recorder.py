@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import errno
 import io
 import json
 import math
+import os
 import threading
+import time
 from pathlib import Path
 from typing import BinaryIO
 
@@ -194,6 +197,53 @@ def stick(recorder: Recorder, failure: OSError | None = None) -> StuckStream:
     stuck = StuckStream(recorder._stream, failure)
     recorder._writer._stream = stuck  # type: ignore[assignment]
     return stuck
+
+
+def told_within(recorder: Recorder, text: str, seconds: float = 30.0) -> None:
+    """Ticks go on, each in no time, until the recorder has told of ``text``."""
+    tick, longest, end = CYCLES[0][0], 0.0, time.monotonic() + seconds
+    while text not in recorder.trouble():
+        begun = time.monotonic()
+        recorder.tick(tick)
+        longest = max(longest, time.monotonic() - begun)
+        assert time.monotonic() < end, "never told"
+        time.sleep(0.004)  # the loop's period
+    assert longest < 0.5
+
+
+def test_a_stuck_disk_is_told_in_flight_before_anything_is_lost(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "log.mcap", INFO, ConfigStub(), "", background=True)
+    stuck = stick(recorder)
+    recorder.event(Event(0, "x", Severity.INFO, "opens a topic, which writes"))
+    assert stuck.entered.wait(10)
+    told_within(recorder, "does not take the log")
+    assert recorder.dropped == 0
+    assert recorder.trouble() == "", "told once"
+    for _ in range(3000):
+        recorder.tick(CYCLES[0][0])
+    assert "records are being lost" in recorder.trouble()
+    assert recorder.trouble() == ""
+    stuck.released.set()
+    recorder.close()
+    assert recorder.trouble() == ""
+
+
+def test_a_full_disk_is_told_in_flight(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "log.mcap", INFO, ConfigStub(), "", background=True)
+    assert recorder.trouble() == ""
+    stick(recorder, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))).released.set()
+    recorder.event(Event(0, "x", Severity.INFO, "opens a topic, which writes"))
+    told_within(recorder, "No space left on device")
+    assert recorder.trouble() == ""
+    recorder.close()
+
+
+def test_a_healthy_disk_is_never_told_of(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "log.mcap", INFO, ConfigStub(), "", background=True) as recorder:
+        for tick, truth in CYCLES[:500]:
+            recorder.tick(tick, truth)
+            assert recorder.trouble() == ""
+    assert recorder.trouble() == ""
 
 
 def test_slow_disk_drops_and_counts_and_never_blocks(tmp_path: Path) -> None:
