@@ -15,6 +15,8 @@ from onboard.messages import Phase
 
 #: Seconds shown before and after the contact.
 _MARGIN = 4.0
+#: Pictures of single late ticks show the largest value of each stretch of so many seconds.
+_STRETCH = 0.5
 #: Kind of a phase, which chooses its colour.
 _KINDS = {
     Phase.PREFLIGHT: "ground",
@@ -135,48 +137,70 @@ def at_the_pipe(run: Run) -> list[Chart]:
     return charts
 
 
-def loop(run: Run) -> list[Chart]:
-    """How punctual the ticks of a wall-clock run were: a histogram, and all of them over time."""
-    late = 1000.0 * np.maximum(run.late[np.isfinite(run.late)], 0.0)
-    if not late.size:
+def punctual(run: Run) -> list[Chart]:
+    """How punctual a wall-clock run was: the ticks, what they had, and what they sent."""
+    if not np.isfinite(run.late).any():
         return []
-    edges = np.geomspace(0.01, 1000.0, 41)
-    # A tick that is less late than the first edge is shown at the first bar.
-    counts, _ = np.histogram(np.clip(late, edges[0], edges[-1]), bins=edges)
-    histogram = Chart("lateness of the ticks", "ticks", (0.01, 1000.0), log="xy", x_label="late by, ms")
-    for low, high, count in zip(edges[:-1].tolist(), edges[1:].tolist(), counts.tolist(), strict=True):
-        histogram.bar(low, high, float(count), f"late by {low:.3g} to {high:.3g} ms: {count} ticks")
-    period = 1000.0 * float(np.nanmedian(punctuality.periods(run))) if len(run.t) > 1 else 0.0
-    if edges[0] < period < edges[-1]:
-        histogram.mark(period, "one period")
     x, t = whole(run), run.t
+    kinds = {**run.ages, "set-point": punctuality.setpoint_ages(run)}
     periods = Chart("from tick to tick", "ms", x)
     periods.line(t[1:], 1000.0 * punctuality.periods(run), "", "c1")
-    punctual = Chart("lateness and duration of the ticks", "ms", x)
-    punctual.line(t, 1000.0 * run.late, "late", "c2").line(t, 1000.0 * run.busy, "busy", "c1")
-    return [histogram, periods, punctual]
-
-
-def ages(run: Run) -> list[Chart]:
-    """Ages of what a wall-clock run had at its ticks and of what it sent: over time, and how often how old."""
-    kinds = {**run.ages, "set-point": punctuality.setpoint_ages(run)}
-    over_time = Chart("age of the newest samples, and of each set-point as it left", "ms", whole(run))
-    often = Chart("how often older than so much", "% of ticks", (0.1, 1000.0), log="xy", x_label="age, ms")
+    worst = Chart(f"largest in each {_STRETCH:g} s", "ms", x)
+    worst.line(*_largest(t, 1000.0 * run.late), "lateness of a tick", "c2")
+    worst.line(*_largest(t, 1000.0 * run.busy), "its duration", "c1")
+    oldest = Chart(f"oldest in each {_STRETCH:g} s: samples at a tick, set-points as they left", "ms", x)
     for i, (name, values) in enumerate(kinds.items()):
-        over_time.line(run.t, 1000.0 * values, name, f"c{i + 1}")
-        ordered = np.sort(1000.0 * values[np.isfinite(values)])
-        share = 100.0 * (1.0 - np.arange(len(ordered)) / max(1, len(ordered)))
-        often.line(ordered, share, name, f"c{i + 1}")
-    return [over_time, often]
+        oldest.line(*_largest(t, 1000.0 * values), name, f"c{i + 1}")
+    return [_lateness(run), _older(kinds), periods, worst, oldest]
+
+
+def _lateness(run: Run) -> Chart:
+    """A histogram; a tick that is less late than its left edge is counted in the first bar."""
+    late = 1000.0 * run.late[np.isfinite(run.late)]
+    low, high = 0.01, _decade_above(float(late.max()))
+    edges = np.geomspace(low, high, 10 * round(np.log10(high / low)) + 1)
+    counts, _ = np.histogram(np.clip(late, low, high), bins=edges)
+    chart = Chart("lateness of the ticks", "ticks", (low, high), log="xy", x_label="late by, ms")
+    for start, end, count in zip(edges[:-1].tolist(), edges[1:].tolist(), counts.tolist(), strict=True):
+        chart.bar(start, end, float(count), f"late by {start:.3g} to {end:.3g} ms: {count} ticks")
+    period = 1000.0 * float(np.median(np.diff(run.t))) if len(run.t) > 1 else 0.0
+    return chart.mark(period, "one period") if low < period < high else chart
+
+
+def _older(kinds: dict[str, Array]) -> Chart:
+    """Share of the ticks at which each age was exceeded."""
+    finite = {name: np.sort(1000.0 * values[np.isfinite(values)]) for name, values in kinds.items()}
+    top = _decade_above(max((float(values[-1]) for values in finite.values() if values.size), default=1.0))
+    chart = Chart("how many of them are older, of samples and set-points", "%", (0.1, top), log="xy", x_label="age, ms")
+    for i, (name, values) in enumerate(finite.items()):
+        chart.line(values, 100.0 * (1.0 - np.arange(len(values)) / max(1, len(values))), name, f"c{i + 1}")
+    return chart
 
 
 def processor(run: Run) -> list[Chart]:
     """Share of a core that each part of the flight process took."""
-    chart = Chart("processor time of the parts of the flight process", "% of one core", whole(run), width=950)
     values = {name: told for name, told in punctuality.device_values(run).items() if name.startswith(punctuality.CPU)}
+    top = max((100.0 * float(np.nanmax(share)) for _, share in values.values()), default=1.0)
+    words = "processor time of the flight process by part, of one core"
+    chart = Chart(words, "%", whole(run), y=(0.0, 1.1 * top), width=950, height=200)
     for i, (name, (t, share)) in enumerate(values.items()):
         chart.line(t, 100.0 * share, name[len(punctuality.CPU) :], f"c{i % 6 + 1}")
     return [chart] if values else []
+
+
+def _decade_above(value: float) -> float:
+    """The power of ten at or above a value, and at least 10."""
+    return float(10.0 ** np.ceil(np.log10(max(value, 10.0))))
+
+
+def _largest(t: Array, values: Array) -> tuple[Array, Array]:
+    """The middle and the largest value of each stretch of ``_STRETCH`` s; stretches without a value are left out."""
+    finite = np.isfinite(values)
+    if not finite.any():
+        return t[:0], values[:0]
+    stretch = np.floor(t[finite] / _STRETCH)
+    first = np.flatnonzero(np.diff(stretch, prepend=-1.0))
+    return (stretch[first] + 0.5) * _STRETCH, np.maximum.reduceat(values[finite], first)
 
 
 def timeline(run: Run) -> str:

@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from groundstation import figures, table
+from groundstation import figures, punctuality, table
 from groundstation.run import Run
 from groundstation.svg import Chart
 from onboard.messages import Severity
@@ -157,13 +157,11 @@ def _timing(run: Run, metrics: dict[str, Any]) -> Iterator[str]:
         )
         yield f'<tr><td>{escape(label)}</td><td class="n">{hertz}</td>{cells}</tr>'
     yield "</table>"
-    for charts in (figures.loop(run), figures.ages(run)):
-        yield '<div class="pair">' + "".join(f"<div>{chart.svg()}</div>" for chart in charts) + "</div>"
+    yield '<div class="pair">' + "".join(f"<div>{chart.svg()}</div>" for chart in figures.punctual(run)) + "</div>"
     yield from (chart.svg() for chart in figures.processor(run))
-    yield from _devices(
-        "Processor", "share of one core", {f"cpu.{k}": v for k, v in timing["cpu"].items()}, 100.0, " %"
-    )
-    yield from _devices("Devices", "reported once a second; times in s, rates in Hz", timing["devices"])
+    shares = {f"{punctuality.CPU}{part}": told for part, told in timing["cpu"].items()}
+    yield from _devices("Processor", "share of one core", shares, 100.0, " %")
+    yield from _devices("Devices", "as reported once a second; times in s, rates in Hz", timing["devices"])
 
 
 def _devices(

@@ -145,7 +145,7 @@ def _restore(message: Message, values: Mapping[str, str], kind: Any) -> Any:
     """Decode a message, putting back what JSON could only write as null."""
     tree = msgspec.json.decode(message.data)
     for path, value in values.items():
-        *parents, last = path.split(".")
+        *parents, last = path.split("/")
         node = tree
         for key in parents:
             node = node[int(key) if isinstance(node, list) else key]

@@ -45,7 +45,7 @@ _STUCK = 0.5
 
 
 def nonfinite(value: object) -> dict[str, str]:
-    """Dotted paths of all floats in a message that are not finite, with their values as text."""
+    """Paths ("outputs/estimate/p_WB/2") of all floats in a message that are not finite, with their values as text."""
     found: dict[str, str] = {}
 
     def walk(node: object, path: str) -> None:
@@ -54,10 +54,10 @@ def nonfinite(value: object) -> dict[str, str]:
                 found[path] = str(node)
         elif isinstance(node, dict):
             for key, child in node.items():
-                walk(child, f"{path}.{key}" if path else str(key))
+                walk(child, f"{path}/{key}" if path else str(key))
         elif isinstance(node, list | tuple):
             for i, child in enumerate(node):
-                walk(child, f"{path}.{i}")
+                walk(child, f"{path}/{i}")
 
     walk(msgspec.to_builtins(value), "")
     return found

@@ -87,4 +87,4 @@ class NonFinite(Struct, frozen=True):
     topic: str
     sequence: int
     values: dict[str, str]
-    """Dotted path to "nan", "inf" or "-inf"."""
+    """Path, its parts joined by "/" since names may hold dots, to "nan", "inf" or "-inf"."""

@@ -11,7 +11,11 @@ from msgspec import Struct
 
 from tests.bench.compare import Comparison
 from tests.bench.core import Core
+from tests.bench.desk import Desk
 from tests.bench.flight import Flight
+from tests.bench.lateness import Lateness
+from tests.bench.servos import ServoCycle
+from tests.bench.setpoints import SetPoints
 
 #: What a desk core must reach in the median, so that a Jetson Nano holds 250 Hz, us.
 TARGET_US = 150
@@ -24,6 +28,11 @@ class Report(Struct, frozen=True):
     core: Core
     flight: Flight
     comparisons: tuple[Comparison, ...]
+    servos: tuple[ServoCycle, ...]
+    setpoints: SetPoints
+    lateness: Lateness
+    desk: Desk | None
+    """None when it was left out."""
 
 
 def conditions(config: str) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.bench.core import Part
+from tests.bench.desk import Desk
 from tests.bench.measure import Stat
 from tests.bench.report import TARGET_US, Report
 
@@ -13,7 +14,9 @@ _EIGHTHS = " ▏▎▍▌▋▊▉"
 
 def table(report: Report) -> str:
     """All of a report, section by section."""
-    return "\n".join([*_conditions(report), *_core(report), *_flight(report), *_comparisons(report)])
+    parts = (_conditions, _core, _flight, _comparisons, _real_time)
+    lines = [line for part in parts for line in part(report)]
+    return "\n".join(lines if report.desk is None else [*lines, *desk_rows(report.desk)])
 
 
 def _head(title: str, *columns: str) -> list[str]:
@@ -92,4 +95,40 @@ def _comparisons(report: Report) -> list[str]:
             lines.append(_line(f"{row.name}, ours", row.ours, f"{1.0:>11.1f}"))
         lines.append(_line(f"  {row.package}", row.theirs, f"{row.ratio:>11.1f}   results {row.difference:.1g} apart"))
         lines.append(f"    ({row.note})")
+    return lines
+
+
+def _real_time(report: Report) -> list[str]:
+    lines = _head("In real time", "median us", "p99 us", "ratio")
+    for row in report.servos:
+        lines.append(
+            f"{f'servo cycle, wire at {row.baud / 1e6:g} Mbit/s':<{_NAME}}{row.wire:>11.2f}{'':>11}{1.0:>11.2f}"
+        )
+        for name, stat, cpu in (("ours", row.ours, row.ours_cpu), ("dynamixel-sdk's port", row.sdk, row.sdk_cpu)):
+            more = f"{stat.median / row.wire:>11.2f}   {cpu:.0f} us of processor"
+            lines.append(_line(f"  {name}", stat, more))
+        if row.failed:
+            lines.append(f"    ({row.failed} cycles had no answer)")
+    points, late = report.setpoints, report.lateness
+    lines.append(_line("bare UDP, sent to arrived", points.bare, f"{1.0:>11.1f}"))
+    lines.append(_line("  set-point, call to arrived", points.ours, f"{points.ratio:>11.1f}"))
+    lines.append(_line("  the call alone", points.call, f"{points.call.median / points.bare.median:>11.1f}"))
+    lines.append(_line("bare timer, lateness", late.bare, f"{1.0:>11.1f}"))
+    lines.append(_line("  the loop with the core", late.loop, f"{late.ratio:>11.1f}"))
+    return lines
+
+
+def desk_rows(desk: Desk) -> list[str]:
+    """The section of the flight in real time."""
+    lines = _head(f"Flight process, {desk.flown_s:.0f} s on the desk", "median us", "p99 us", "of a core")
+    lines.append(f"{'lateness of the ticks':<{_NAME}}{desk.late_median:>11.2f}{desk.late_p99:>11.2f}")
+    if desk.setpoint_age is not None:
+        lines.append(f"{'age of a set-point as it left':<{_NAME}}{desk.setpoint_age:>11.2f}")
+    lines.append(f"{'missed ticks':<{_NAME}}{100.0 * desk.missed:.3f} %")
+    for part, share in sorted(desk.cpu.items(), key=lambda item: -item[1]):
+        lines.append(
+            f"{f'processor: {part}':<{_NAME}}{'':>22}{100.0 * share:>9.1f} %   {_bar(min(1.0, share))}".rstrip()
+        )
+    if desk.cpu:
+        lines.append(f"{'processor: all parts':<{_NAME}}{'':>22}{100.0 * sum(desk.cpu.values()):>9.1f} %")
     return lines

@@ -16,7 +16,7 @@ from groundstation.run import Run, read_run
 from groundstation.svg import Chart, number, thin, ticks
 from onboard.core.types import Event, Phase, Severity
 from onboard.recorder import Recorder
-from onboard.records import RunInfo, Timing
+from onboard.records import DeviceReport, RunInfo, Timing
 from tests.synthetic import ConfigStub, change_outputs, mission, record
 
 CYCLES = list(mission())
@@ -123,12 +123,24 @@ def test_wall_clock_run_shows_its_punctuality(tmp_path: Path) -> None:
         for tick, truth in CYCLES[:500]:
             recorder.tick(tick, truth)
             recorder.timing(Timing(tick.index, tick.inputs.t_ns, 0.0012, 0.0004, 0.0003))
+        for second in (0, 1):
+            recorder.devices(DeviceReport(10**9 * second, {"cpu.loop": 0.25, "servos.cycle.p99": 0.0021}))
+        recorder.event(Event(1_000_000_000, "servo bus", Severity.WARNING, "servo 3 does not answer"))
     run = read_run(tmp_path / "log.mcap")
     report.write(run, metrics.compute(run), tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     parse(page)
     assert "Punctuality" in page
     assert '<td class="n">250.0</td><td class="n">1.20</td>' in page
+    assert "0 of the ticks owed were missed (0.000 %)" in page
+    for title in ("lateness of the ticks", "from tick to tick", "largest in each 0.5 s", "oldest in each 0.5 s"):
+        assert f'aria-label="{title}' in page
+    assert "late by 1 to 1.26 ms: 500 ticks" in page
+    assert 'data-label="set-point"' in page
+    assert 'data-label="loop"' in page
+    assert '<td>cpu.loop</td><td class="n">25 %</td>' in page
+    assert '<td>servos.cycle.p99</td><td class="n">0.0021</td>' in page
+    assert "△ servo 3 does not answer" in page
     assert "begun 2025-01-02T03:04:05+00:00" in page
 
 
@@ -187,6 +199,21 @@ def test_chart_places_points_and_limits() -> None:
     assert 'points="46.0,140.0 146.0,40.0"' in text
     assert '<path class="limit" d="M46 90.0H146"/>' in text
     assert "a &lt; b" in text
+    parse(text)
+
+
+def test_logarithmic_axes_are_laid_out_by_decades() -> None:
+    chart = Chart("ages", "%", (0.1, 10.0), y=(1.0, 100.0), width=256, height=172, log="xy")
+    chart.line(np.array([0.1, 1.0, 2.0, 10.0]), np.array([100.0, 10.0, 0.0, 1.0]), "", "c1")
+    chart.bar(0.1, 1.0, 10.0, "ten").bar(1.0, 10.0, 0.0, "none").mark(1.0, "one")
+    text = chart.svg()
+    assert 'points="46.0,40.0 146.0,90.0 246.0,140.0"' in text  # zero has no place
+    assert '<rect class="bar" x="46.0" y="90.0" width="100.0" height="50.0">' in text
+    assert text.count('class="bar"') == 1
+    assert '<path class="limit" d="M146.0 40V140"/>' in text
+    assert [float(v) for v in re.findall(r'class="tick mid"[^>]*>([\d.]+)</text>', text)] == [0.1, 1.0, 10.0]
+    assert [float(v) for v in re.findall(r'class="tick end"[^>]*>([\d.]+)</text>', text)] == [1.0, 10.0, 100.0]
+    assert 'data-range="-1 1 0 2" data-log="xy"' in text
     parse(text)
 
 
