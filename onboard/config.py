@@ -18,6 +18,7 @@ from onboard.core.params import Params
 from onboard.device_config import DeviceConfig
 from onboard.layers import ConfigError, Layer, parse_set, read_yaml
 from onboard.params import compose, dump_yaml
+from onboard.scheduling import ProcessParams
 from sim_backend.faults import Fault
 from sim_backend.world import WorldParams
 
@@ -42,6 +43,7 @@ class Config(Params, frozen=True, kw_only=True):
     faults: tuple[Fault, ...] = ()
     """What goes wrong with emulated devices."""
     devices: DeviceConfig = DeviceConfig()
+    process: ProcessParams = ProcessParams()
 
 
 def load_config(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from math import radians
+from math import isfinite, radians
+from time import monotonic_ns
 from typing import Any
 
 from msgspec.structs import replace
@@ -14,6 +15,7 @@ from drivers.mailbox import Notice
 from drivers.protocols import AutopilotDevice, Device, DeviceError, OdometryDevice, ServoDevice
 from drivers.px4 import Px4
 from drivers.samples import Interface
+from drivers.spread import Summary
 from drivers.t265 import T265
 from drivers.thrust import ThrustMap
 from onboard.config import Config
@@ -93,6 +95,7 @@ class FlightDevices(DeviceSet):
         self._px4: Px4 | None = None
         self._tracker: T265 | None = None
         self._camera: SoftwareCamera | None = None
+        self._bus: Dynamixel | None = None
         self.world: WorldClient | None = None
         if any(kind is not Kind.REAL for kind in kinds.values()):
             mocks = tuple(name for name, kind in kinds.items() if kind is Kind.MOCK)
@@ -129,7 +132,8 @@ class FlightDevices(DeviceSet):
         if settings.kind is Kind.MOCK:
             assert self.world is not None
             return LinkedServos(self.world)
-        return Dynamixel(settings)
+        self._bus = Dynamixel(settings)
+        return self._bus
 
     # -- life cycle -----------------------------------------------------------------------------------------------
 
@@ -179,6 +183,24 @@ class FlightDevices(DeviceSet):
         told = [notice for device in self._named.values() for notice in device.notices()]
         return tuple(sorted(told, key=lambda notice: notice.t_ns))
 
+    def statistics(self) -> dict[str, float]:
+        """Rates, counts and times of drivers and link since the start, by dotted name; SI."""
+        values: dict[str, float] = {}
+        now = monotonic_ns()
+        if self._px4 is not None:
+            values |= {f"autopilot.{name}.rate": counts.rate for name, counts in self._px4.counts().items()}
+            values |= {"autopilot.setpoints": self._px4.sent(), "autopilot.poses": self._px4.vision_sent()}
+        if self._tracker is not None:
+            values |= {f"odometry.{name}.rate": counts.rate for name, counts in self._tracker.counts().items()}
+        if self._bus is not None:
+            bus = self._bus.statistics()
+            values |= {f"servos.cycle.{name}": value for name, value in _percentiles(bus.cycle).items()}
+            values |= {f"servos.period.{name}": value for name, value in _percentiles(bus.period).items()}
+            values |= {"servos.rate": bus.samples.rate, "servos.errors": float(sum(bus.errors.values()))}
+        if self.world is not None and (look := self.world.latest()) is not None:
+            values |= {"world.age": (now - look.t_ns) * 1e-9, "world.slipped": look.slipped}
+        return {name: float(value) for name, value in values.items() if isfinite(value)}
+
     def tell_phase(self, phase: str) -> None:
         """The mission's phase, for faults that are declared for one."""
         if self.world is not None:
@@ -205,6 +227,10 @@ class FlightDevices(DeviceSet):
             device.gone = camera.gone
             for pose in camera.poses:
                 device.tell(pose)
+
+
+def _percentiles(summary: Summary) -> dict[str, float]:
+    return {"p50": summary.p50, "p99": summary.p99, "max": summary.max}
 
 
 def _mixed(kinds: dict[str, Kind], hitl: bool) -> tuple[str, ...]:

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
 from msgspec import Struct
 
-from drivers.mailbox import Level, Notice
+from drivers.mailbox import Level
 from onboard import attended
 from onboard.clock import WallClock
 from onboard.config import Config, dump_config
-from onboard.core.params import Params
-from onboard.core.step import State
-from onboard.core.types import Event, Outputs, Phase, Request, Severity, Tick
+from onboard.core.types import Event, Outputs, Phase, Request, Severity
 from onboard.devices import FlightDevices
+from onboard.ending import Ending, hand_over, signals
 from onboard.errand import Errand
 from onboard.loop import Loop
 from onboard.recorder import Recorder
-from onboard.records import Timing
+from onboard.records import DeviceReport
+from onboard.reload import Reloader
+from onboard.scheduling import Collector, ask
 from onboard.simulate import run_info
+from onboard.systemd import Notifier
 from sim_backend.world_messages import Look
 
 #: A driver's notice as an event of the log.
 _SEVERITY = {Level.INFO: Severity.INFO, Level.WARNING: Severity.WARNING, Level.ERROR: Severity.ERROR}
 #: A mission that has not ended by then is broken off, s.
 LONGEST = 900.0
+_REPORT_NS = 1_000_000_000
+_JOIN = 2.0
 
 
 class Options(Struct, frozen=True):
@@ -41,45 +44,36 @@ class Options(Struct, frozen=True):
     """Take requests as lines of standard input, and end in order when it closes."""
 
 
-class _Sink:
-    """Where the loop's ticks go: the recorder."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
-
-    def tick(self, tick: Tick) -> None:
-        self._recorder.tick(tick)
-
-    def keyframe(self, index: int, t_ns: int, state: State) -> None:
-        self._recorder.keyframe(index, t_ns, state)
-
-    def timing(self, timing: Timing) -> None:
-        self._recorder.timing(timing)
-
-    def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None:
-        self._recorder.revision(index, t_ns, revision, config)
-
-
 async def fly(
     config: Config,
     log: Path,
     options: Options,
+    load: Callable[[], Config],
     watch: Callable[[Outputs, float], None],
     say: Callable[[str], None],
-) -> None:
-    """Connect, run the loop until the flight is over, and record it to ``log``.
+) -> bool:
+    """Connect, run the loop until the flight is over, and record it to ``log``; False: broken off before it began.
 
-    ``watch`` sees outputs and time (s) of each tick; ``say`` gets sentences for the person at the terminal. Raises
-    DeviceError when a device cannot be had, ConfigError for devices that cannot be flown.
+    ``load`` reads the configuration again, when a reload is asked for; ``watch`` sees outputs and time (s) of each
+    tick; ``say`` gets sentences for the person at the terminal. Raises DeviceError when a device cannot be had,
+    ConfigError for devices that cannot be flown.
     """
     devices = FlightDevices(config)
-    try:
-        await devices.start(say)
-        await _Flight(config, options, devices, watch, say).run(log)
-    finally:
-        await devices.stop()
-        for notice in devices.notices():
-            say(notice.text)
+    with Notifier() as notifier:
+        flight = _Flight(config, options, devices, notifier, watch, say)
+        with signals(flight.ending, flight.reload):
+            try:
+                notifier.status("connecting")
+                if options.attended:
+                    attended.watch(flight.order, lambda: flight.ending.ask("standard input has closed"))
+                await devices.start(say)
+                await flight.run(log, load)
+            finally:
+                notifier.stopping()
+                await devices.stop()
+                for notice in devices.notices():
+                    say(notice.text)
+    return flight.began
 
 
 class _Flight:
@@ -90,75 +84,116 @@ class _Flight:
         config: Config,
         options: Options,
         devices: FlightDevices,
+        notifier: Notifier,
         watch: Callable[[Outputs, float], None],
         say: Callable[[str], None],
     ) -> None:
-        self._config, self._options, self._devices = config, options, devices
+        self._config, self._options, self._devices, self._notifier = config, options, devices, notifier
         self._watch, self._say = watch, say
         self._clock = WallClock()
+        self._loop: Loop | None = None
+        self._reloader: Reloader | None = None
+        self.began = False
         self._ready = False
-        self._over = False
+        self._report_ns = 0
+        self.ending = Ending(self._request)
 
-    async def run(self, log: Path) -> None:
+    def _request(self, request: Request) -> None:
+        if self._loop is not None:
+            self._loop.request(request)
+
+    def order(self, line: str) -> None:
+        """A request from standard input, in a thread of its own."""
+        try:
+            self._request(Request(line))
+        except ValueError:
+            self._say(f"no such request: {line!r}; there are: {', '.join(Request)}")
+
+    def reload(self) -> None:
+        """Read the configuration again."""
+        if self._reloader is not None:
+            self._notifier.reloading()
+            self._reloader.ask()
+
+    async def run(self, log: Path, load: Callable[[], Config]) -> None:
         """Tick until the flight is over."""
-        config = self._config
+        config, clock, devices = self._config, self._clock, self._devices
         info = run_info(config, realtime=True, started=datetime.now().astimezone().isoformat(timespec="seconds"))
-        began = self._clock.now_ns()
-        with Recorder(log, info, config, dump_config(config), t_ns=began, background=True) as self._recorder:
-            self._devices.on_look = self._look
-            self._loop = Loop(self._devices, self._clock, config, _Sink(self._recorder), timed=True)
-            self._errand = Errand(self._loop.request, LONGEST) if self._options.mission else None
-            self._first = self._clock.now_ns()
-            # what lives by now lives to the end: the collector need not look at it in flight
-            gc.collect()
-            gc.freeze()
-            if self._options.attended:
-                attended.watch(self._order, self._end)
+        refused = ask(config.process)
+        with Recorder(log, info, config, dump_config(config), t_ns=clock.now_ns(), background=True) as recorder:
+            self._recorder = recorder
+            self._loop = loop = Loop(devices, clock, config, recorder, timed=True)
+            self._reloader = Reloader(load, loop)
+            self._errand = Errand(loop.request, LONGEST) if self._options.mission else None
+            devices.on_look = self._look
+            for sentence in refused:
+                self._tell(Event(clock.now_ns(), "process", Severity.WARNING, sentence))
+            self._first_ns = clock.now_ns()
             try:
-                await self._loop.run(self._on_tick)
+                with Collector(config.process) as self._collector:
+                    await loop.run(self._on_tick)
+                if (command := self.ending.handed_over) is not None:
+                    sentence = await hand_over(devices.autopilot, command, clock)
+                    self._tell(Event(clock.now_ns(), "handed_over", Severity.WARNING, sentence))
             finally:
-                gc.unfreeze()
-                self._devices.on_look = None
-        if self._recorder.error is not None:
-            self._say(f"the log is incomplete: {self._recorder.error}")
-        if self._recorder.dropped:
-            self._say(f"{self._recorder.dropped} records were not written")
+                devices.on_look = None
+                self._reloader.close()
+                self._reloader.join(_JOIN)
+        if recorder.error is not None:
+            self._say(f"the log is incomplete: {recorder.error}")
+        if recorder.dropped:
+            self._say(f"{recorder.dropped} records were not written")
 
     def _on_tick(self, outputs: Outputs) -> bool:
-        t = (self._clock.now_ns() - self._first) * 1e-9
+        now = self._clock.now_ns()
+        t = (now - self._first_ns) * 1e-9
+        self._notifier.tick(now)
         self._watch(outputs, t)
         self._devices.tell_phase(outputs.phase.value)
-        for event in outputs.events:
+        goes_on = self._goes_on(outputs, t)
+        self._tell_what_there_is(outputs, now)
+        if now >= self._report_ns:
+            self._report_ns = now + _REPORT_NS
+            self._recorder.devices(DeviceReport(now, self._devices.statistics()))
+        self._collector.tick(outputs.phase)
+        return goes_on
+
+    def _goes_on(self, outputs: Outputs, t: float) -> bool:
+        if self._options.duration is not None and t >= self._options.duration:
+            self.ending.ask(f"{self._options.duration:g} s are over")
+            self._options = Options(self._options.mission, None, self._options.attended)
+        mission = self._errand is None or self._errand.goes_on(outputs, t)
+        return self.ending.goes_on(outputs, t) and mission and not self._devices.lost
+
+    def _tell_what_there_is(self, outputs: Outputs, now: int) -> None:
+        if not self.began:
+            self.began = True
+            self._notifier.ready()
+        for event in outputs.events:  # the recorder has these from the tick
             if event.severity is not Severity.INFO:
                 self._say(event.text)
         for notice in self._devices.notices():
-            self._tell(notice)
-        if (
-            not self._ready
-            and outputs.phase is Phase.PREFLIGHT
-            and outputs.estimate.valid
-            and not outputs.verdict.reasons
-        ):
+            self._tell(Event(notice.t_ns, notice.text.partition(":")[0], _SEVERITY[notice.level], notice.text))
+        assert self._reloader is not None
+        if changes := self._reloader.events(now):
+            self._notifier.ready()
+        for event in (*self.ending.events(now), *changes):
+            self._tell(event)
+        for code, trouble in (("log", self._recorder.trouble()), ("systemd", self._notifier.trouble())):
+            if trouble:
+                self._tell(Event(now, code, Severity.ERROR, trouble))
+        if not self._ready and outputs.phase is Phase.PREFLIGHT and _passes(outputs):
             self._ready = True
             self._say("ready to fly: preflight passes")
-        if self._devices.lost or self._over:
-            return False
-        return self._errand is None or self._errand.goes_on(outputs, t)
+        self._notifier.status(outputs.phase.value)
 
-    def _end(self) -> None:
-        self._over = True
-
-    def _order(self, line: str) -> None:
-        """A request from standard input, in a thread of its own."""
-        try:
-            self._loop.request(Request(line.strip()))
-        except ValueError:
-            self._say(f"no such request: {line.strip()!r}; there are: {', '.join(Request)}")
+    def _tell(self, event: Event) -> None:
+        self._recorder.event(event)
+        self._say(event.text)
 
     def _look(self, look: Look) -> None:
         self._recorder.truth(look.t_ns, look.truth)
 
-    def _tell(self, notice: Notice) -> None:
-        source = notice.text.partition(":")[0]
-        self._recorder.event(Event(notice.t_ns, source, _SEVERITY[notice.level], notice.text))
-        self._say(notice.text)
+
+def _passes(outputs: Outputs) -> bool:
+    return outputs.estimate.valid and not outputs.verdict.reasons

@@ -1,6 +1,7 @@
 """``python -m onboard``: the flight process, and what goes with it, as a person or the ground station starts them.
 
-Exit codes: 0 the run ended by itself and its log is complete, 2 wrong input, 5 a device cannot be had.
+Exit codes: 0 the run ended by itself or as asked and its log is complete, 2 wrong input, 5 a device cannot be had,
+130 interrupted before it began.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from onboard.core.plan import InfeasibleError
 from onboard.core.types import Outputs, Phase
 from onboard.layers import ConfigError
 
-WRONG_INPUT, NO_DEVICE = 2, 5
+WRONG_INPUT, NO_DEVICE, INTERRUPTED = 2, 5, 130
 #: Phases of a mission in order, for the progress bar.
 CHAIN = (
     Phase.PREFLIGHT, Phase.TAKEOFF, Phase.APPROACH, Phase.ALIGN, Phase.ADHESIVE, Phase.TOOL_CHANGE, Phase.TARE,
@@ -52,6 +53,13 @@ class Progress:
         elif self._count % 250:
             return
         self._bar.set_postfix_str(f"{t:6.1f} s flown")
+
+    def say(self, text: str) -> None:
+        """A sentence, above the bar if there is one."""
+        if self._bar is None:
+            print(text, file=sys.stderr, flush=True)
+        else:
+            self._bar.write(text, file=sys.stderr)
 
     def close(self) -> None:
         """Take the bar away."""
@@ -135,20 +143,26 @@ def _sim(options: argparse.Namespace) -> int:
 def _fly(options: argparse.Namespace) -> int:
     from onboard.devices import check_devices
     from onboard.fly import Options, fly
+    from onboard.scheduling import event_loop
 
-    config = load_config(options.scenario, options.law, options.sets, options.seed)
+    def load() -> Config:
+        return load_config(options.scenario, options.law, options.sets, options.seed)
+
+    config = load()
     check_devices(config)
     log = _prepare(config, options.out)
     progress = Progress(not options.no_progress and sys.stderr.isatty())
 
     def say(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
+        progress.say(text)
 
+    how = Options(options.mission, options.duration, options.attended)
     try:
-        asyncio.run(fly(config, log, Options(options.mission, options.duration, options.attended), progress, say))
+        with asyncio.Runner(loop_factory=event_loop) as runner:
+            flown = runner.run(fly(config, log, how, load, progress, say))
     finally:
         progress.close()
-    return 0
+    return 0 if flown else INTERRUPTED
 
 
 def _world(options: argparse.Namespace) -> int:

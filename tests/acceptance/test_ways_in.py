@@ -64,5 +64,5 @@ def test_targets_of_the_readme_exist() -> None:
 def test_commands_of_the_readme_are_accepted() -> None:
     for arguments in shown("pipewright"):
         options = cli._parser().parse_args(arguments)
-        if options.run is cli._fly and Path(options.scenario or "").suffix == "":
+        if hasattr(options, "scenario") and Path(options.scenario or "").suffix == "":
             load_config(options.scenario or "paper", options.law, options.sets, options.seed)

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from onboard.clock import WallClock
 from onboard.config import Config, dump_config
+from onboard.core.params import Params
 from onboard.core.step import State
 from onboard.core.types import Outputs, Tick
 from onboard.loop import Loop
@@ -85,6 +86,8 @@ class _Sink:
     def timing(self, timing: Timing) -> None:
         self._recorder.timing(timing)
         self.late.append(max(0, round(1e9 * timing.late)))
+
+    def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None: ...
 
 
 def measure(ticks: Sequence[Tick], config: Config, turns: int = 4) -> Lateness:

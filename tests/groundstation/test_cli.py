@@ -245,7 +245,7 @@ def test_interrupts_reach_the_flight_process_once(monkeypatch: pytest.MonkeyPatc
     helper = threading.Thread(target=interrupt)
     helper.start()
     before = signal.getsignal(signal.SIGINT)
-    code = cli._onboard(["sim"])
+    code = cli._flight_process(["sim"])
     helper.join()
     os.close(write_end)
     assert code == 41

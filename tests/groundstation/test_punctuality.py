@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from groundstation.metrics import compute
 from groundstation.run import TRUTH_LASTS, read_run
 from onboard.config import Config, load_config
+from onboard.core.params import Params
 from onboard.core.step import State
 from onboard.core.types import Event, Phase, Severity, Tick
 from onboard.devices import mock_devices, world_of
@@ -56,6 +57,8 @@ class Sink:
     def timing(self, timing: Timing) -> None:
         if timing.index not in self._lost:
             self._recorder.timing(timing)
+
+    def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None: ...
 
 
 @pytest.fixture(scope="module")

@@ -125,7 +125,7 @@ class Flying:
     def wait(
         self, what: str, happens: Callable[[Look], bool], patience: float = PATIENCE, since: Look | None = None
     ) -> Look:
-        """The first look at which something is so, from now or ``since`` on. Fails with ``what`` when it never comes."""
+        """The first look at which something is so, from now or ``since`` on; fails with ``what`` when none comes."""
         seen = len(self.looks) - 1
         while since is not None and self.looks[seen].t_ns > since.t_ns:
             seen -= 1

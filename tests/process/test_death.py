@@ -1,15 +1,13 @@
-"""The flight process hangs or dies: nothing leaves after its last fresh tick, the autopilot lands, the servos let go."""
+"""The flight process hangs or dies: nothing leaves after its last tick, the autopilot lands, the servos let go."""
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from sim_backend.world_messages import Look
 from tests.process.flying import Flying, flying
 
 #: COM_OF_LOSS_T, and what may come on top of it, s.
