@@ -48,13 +48,26 @@ class Descent(Struct, frozen=True, gc=False):
     speed: float
 
 
+class Rotors(Struct, frozen=True, gc=False):
+    """What an autopilot outside this world has its motors do."""
+
+    armed: bool
+    thrust: tuple[float, float, float, float]
+    """N, in PX4's numbering."""
+
+
+STOPPED = Rotors(False, (0.0, 0.0, 0.0, 0.0))
+
 _KINDS = {Interface.WRENCH: loops.WRENCH, Interface.ATTITUDE: loops.ATTITUDE, Interface.BODY_RATE: loops.BODY_RATE}
 
 
-def _drive(u: Array, demand: SetPoint | Descent | None) -> None:
+def _drive(u: Array, demand: SetPoint | Descent | Rotors | None) -> None:
     """Write into ``u`` what the inner loops shall follow; None stops the motors."""
     if demand is None:
         u[at.U_SETPOINT] = loops.NONE
+    elif isinstance(demand, Rotors):
+        u[at.U_SETPOINT] = loops.ROTORS
+        u[at.U_ROTOR : at.U_ROTOR + 4] = demand.thrust
     elif isinstance(demand, Descent):
         u[at.U_SETPOINT] = loops.VELOCITY
         u[at.U_THRUST] = demand.speed
@@ -75,12 +88,22 @@ class Autopilot:
         self.mode = FlightMode.HOLD
         self.landed = Landed.ON_GROUND
         self.killed = False
+        self._rotors: Rotors | None = None
         self._pending: deque[tuple[float, SetPoint]] = deque()
         self._setpoint: SetPoint | None = None
         self._stream_start = 0.0
         self._stream_last = -inf
         self._rest_since: float | None = 0.0
         self._landed_at = 0.0
+
+    def hand_over(self, rotors: Rotors) -> None:
+        """From now on an autopilot outside this world flies, and this is what its motors do.
+
+        What is left here is the land detector. Its mode is not known: FlightMode.OTHER.
+        """
+        self._rotors = rotors
+        self.armed = rotors.armed
+        self.mode = FlightMode.OTHER
 
     def offer(self, t: float, setpoint: SetPoint) -> None:
         """Take one set-point, received at ``t``; it reaches the loops after the interface's delay.
@@ -141,6 +164,9 @@ class Autopilot:
         """Land detector, failsafe, disarming after landing, and the set-point that is due at ``t``."""
         params = self.params
         self._detect_land(t, on_ground, speed)
+        if self._rotors is not None:
+            _drive(u, self._rotors)
+            return
         if self.armed and self.mode is FlightMode.OFFBOARD and t - self._stream_last > params.offboard_timeout:
             self.mode = FlightMode.LAND
         landed = self.landed is Landed.ON_GROUND

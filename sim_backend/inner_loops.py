@@ -23,7 +23,7 @@ Three = tuple[float, float, float]
 Four = tuple[float, float, float, float]
 
 #: What ``u[U_SETPOINT]`` says.
-NONE, WRENCH, ATTITUDE, BODY_RATE, VELOCITY = 0.0, 1.0, 2.0, 3.0, 4.0
+NONE, WRENCH, ATTITUDE, BODY_RATE, VELOCITY, ROTORS = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0
 
 
 class LoopParams(Struct, frozen=True, forbid_unknown_fields=True):
@@ -230,6 +230,8 @@ def _fly_by_velocity(x: Array, p: Array, u: Array) -> tuple[float, float, float,
 def inner_loops(x: Array, p: Array, u: Array) -> None:
     """Run the loops once: from the set-point in ``u`` to the rotor thrusts demanded, also in ``u``."""
     kind = u[at.U_SETPOINT]
+    if kind == ROTORS:
+        return
     if kind == NONE:
         for i in range(4):
             u[at.U_ROTOR + i] = 0.0

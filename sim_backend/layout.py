@@ -130,13 +130,13 @@ L_TURNING = 28  # 3 x (along, about y, across), of the parts turning with each a
 L_ROTOR = 37  # reflected rotor inertia
 
 # ---- u: drive -----------------------------------------------------------------------------------------------------
-U_ROTOR = 0  # 4, thrust demanded, N
+U_ROTOR = 0  # 4, thrust demanded, N: by the inner loops, or by an autopilot outside
 U_TORQUE = 4  # 3, joint torque demanded, N m
 U_POSITION_MODE = 7
 U_GOAL = 8  # 5, rad
 U_CURRENT_LIMIT = 13  # A
 U_TORQUE_ON = 14
-U_SETPOINT = 15  # 0 none, 1 wrench, 2 attitude, 3 body rate, 4 velocity
+U_SETPOINT = 15  # 0 none, 1 wrench, 2 attitude, 3 body rate, 4 velocity, 5 rotors
 U_THRUST = 16  # N; for a velocity: downwards, m/s
 U_BODY_TORQUE = 17  # 3, N m
 U_ATTITUDE = 20  # 4

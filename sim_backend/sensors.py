@@ -146,6 +146,18 @@ def _turned(x: Sequence[float], error: Vec3) -> Quat:
 _EXACT: Vec3 = (0.0, 0.0, 0.0)
 
 
+def imu_errors(
+    params: AutopilotSensorParams, gyro_bias: Vec3, accelerometer_bias: Vec3, noise: Sequence[float], now: Snapshot
+) -> tuple[Vec3, Vec3]:
+    """Errors of the body rate (rad/s) and of the specific force (m/s^2), B, of six standard normal numbers."""
+    acceleration = _plus(accelerometer_bias, params.accelerometer_noise, noise[3:6])
+    if now.armed:
+        phase = 2.0 * pi * params.vibration_frequency * (now.t_ns * 1e-9)
+        shake = (sin(phase), sin(phase + 2.1), sin(phase + 4.2))
+        acceleration = _plus(acceleration, params.vibration, shake)
+    return _plus(gyro_bias, params.gyro_noise, noise[0:3]), acceleration
+
+
 class Sensors:
     """The three devices' measurements. ``observe`` sees every snapshot once; the others tell the newest sample.
 
@@ -218,12 +230,7 @@ class Sensors:
         params = self._params.autopilot
         noise = self._random.standard_normal(12).tolist()
         tilt = _plus(self._tilt.step(noise[0:3]), params.attitude_noise, noise[3:6])
-        acceleration = _plus(self._accelerometer_bias, params.accelerometer_noise, noise[9:12])
-        if now.armed:
-            phase = 2.0 * pi * params.vibration_frequency * (now.t_ns * 1e-9)
-            shake = (sin(phase), sin(phase + 2.1), sin(phase + 4.2))
-            acceleration = _plus(acceleration, params.vibration, shake)
-        rate = _plus(self._gyro_bias, params.gyro_noise, noise[6:9])
+        rate, acceleration = imu_errors(params, self._gyro_bias, self._accelerometer_bias, noise[6:12], now)
         return _autopilot_state(now, _turned(now.x, tilt), rate, acceleration)
 
     def _measure_servos(self, now: Snapshot) -> ServoState:
