@@ -43,6 +43,7 @@ from drivers.samples import (
     Quat,
     Vec3,
 )
+from drivers.threads import named
 from drivers.thrust import ThrustMap
 
 
@@ -302,10 +303,11 @@ class Px4:
         _hush()
         # The onboard computer shares the vehicle's system id, as PX4 expects of a companion.
         configuration = mavsdk.Configuration.create_manual(_SYSTEM, _ONBOARD_COMPUTER, True)
-        self._hub = mavsdk.Mavsdk(configuration)
+        with named("mavsdk"):
+            self._hub = mavsdk.Mavsdk(configuration)
         configuration.destroy()
         try:
-            await asyncio.to_thread(self._hub.add_any_connection_with_handle, url)
+            await asyncio.to_thread(_connect, self._hub, url)
         except Exception as error:
             raise DeviceError(
                 f"autopilot: cannot open {url} ({error}); {_WANTED_URL}, and no other process on that port"
@@ -700,6 +702,12 @@ class Px4:
         if text not in self._refusals:
             self._refusals.add(text)
             self._tell(Level.WARNING, text)
+
+
+def _connect(hub: Any, url: str) -> None:
+    """Raises MAVSDK's error when the connection cannot be opened."""
+    with named("mavsdk"):
+        hub.add_any_connection_with_handle(url)
 
 
 @cache

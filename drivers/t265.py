@@ -22,6 +22,7 @@ from drivers.frames import attitude_from_tracker, from_tracker
 from drivers.mailbox import Level, Mailbox, MailboxCounts, Notice, Notices
 from drivers.protocols import DeviceError
 from drivers.samples import Odometry
+from drivers.threads import named
 from drivers.tracking import CameraPose, Coordinate, Jump, JumpLimits, Mount, Tracking, UnusableError
 
 T = TypeVar("T")
@@ -453,10 +454,11 @@ def _in_thread(work: Callable[[], T]) -> asyncio.Future[T]:
 
     def run() -> None:
         result, error = None, None
-        try:
-            result = work()
-        except Exception as raised:
-            error = raised
+        with named("realsense"):
+            try:
+                result = work()
+            except Exception as raised:
+                error = raised
         if not loop.is_closed():
             loop.call_soon_threadsafe(settle, result, error)
 

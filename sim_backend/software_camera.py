@@ -11,6 +11,7 @@ from drivers.frames import tracker_from, tracker_from_attitude
 from drivers.protocols import DeviceError
 from drivers.samples import Vec3
 from drivers.t265 import library
+from drivers.threads import named
 from drivers.tracking import CameraPose
 from sim_backend.mock_devices import Clock
 from sim_backend.tracker import PERIOD
@@ -41,7 +42,8 @@ class SoftwareCamera:
         #: Frames that were sent so far.
         self.sent = 0
         self._rs = library()
-        self._device, self._sensor, self._profile = _software_device(self._rs)
+        with named("realsense"):
+            self._device, self._sensor, self._profile = _software_device(self._rs)
 
     def find(self) -> Any:
         """The device, for the driver to open; raises DeviceError while it is gone."""
