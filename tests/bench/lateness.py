@@ -15,8 +15,6 @@ from msgspec.structs import replace
 
 from onboard.clock import WallClock
 from onboard.config import Config, dump_config
-from onboard.core.params import Params
-from onboard.core.step import State
 from onboard.core.types import Outputs, Tick
 from onboard.loop import Loop
 from onboard.recorder import Recorder
@@ -70,22 +68,14 @@ class _Devices:
         return ()
 
 
-class _Sink:
-    """The recorder, and how late each tick was, ns."""
+class _Recorder(Recorder):
+    """The recorder as in flight, and how late each tick was."""
 
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
-        self.late: list[int] = []
-
-    def tick(self, tick: Tick) -> None:
-        self._recorder.tick(tick)
-
-    def keyframe(self, index: int, t_ns: int, state: State) -> None:
-        self._recorder.keyframe(index, t_ns, state)
+    late_ns: list[int]
 
     def timing(self, timing: Timing) -> None:
-        self._recorder.timing(timing)
-        self.late.append(max(0, round(1e9 * timing.late)))
+        super().timing(timing)
+        self.late_ns.append(max(0, round(1e9 * timing.late)))
 
     def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None: ...
 
@@ -96,9 +86,10 @@ def measure(ticks: Sequence[Tick], config: Config, turns: int = 4) -> Lateness:
     bare: list[int] = []
     with TemporaryDirectory() as folder:
         info = RunInfo("bench", config.scenario, config.law, config.seed, realtime=True)
-        with Recorder(Path(folder) / "log.mcap", info, config, dump_config(config), background=True) as recorder:
-            sink = _Sink(recorder)
-            loop = Loop(_Devices(ticks), WallClock(), config, sink, timed=True)
+        recorder = _Recorder(Path(folder) / "log.mcap", info, config, dump_config(config), background=True)
+        recorder.late_ns = []
+        with recorder:
+            loop = Loop(_Devices(ticks), WallClock(), config, recorder, timed=True)
             requests = {i: tick.inputs.request for i, tick in enumerate(ticks) if tick.inputs.request is not None}
             done = 0
 
@@ -117,7 +108,7 @@ def measure(ticks: Sequence[Tick], config: Config, turns: int = 4) -> Lateness:
                     bare += _bare(a_turn)
             finally:
                 gc.unfreeze()
-    return Lateness(stat(sink.late), stat(bare))
+    return Lateness(stat(recorder.late_ns), stat(bare))
 
 
 def _bare(count: int) -> list[int]:

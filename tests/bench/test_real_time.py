@@ -6,6 +6,7 @@ import pytest
 
 from onboard.config import load_config
 from onboard.core.types import Tick
+from onboard.recorder import Recorder
 from tests.bench import desk, flight, lateness, setpoints
 from tests.bench.desk import Desk
 from tests.bench.table import WIDTH, desk_rows
@@ -19,14 +20,14 @@ def ticks() -> list[Tick]:
 def test_the_loop_runs_on_what_the_mission_had(ticks: list[Tick], monkeypatch: pytest.MonkeyPatch) -> None:
     requests: list[tuple[int, object]] = []
     phases = []
-    record = lateness._Sink.tick
+    record = Recorder.tick
 
-    def tick(self: lateness._Sink, tick: Tick) -> None:
+    def tick(self: Recorder, tick: Tick) -> None:
         requests.extend([(tick.index, tick.inputs.request)] if tick.inputs.request is not None else [])
         phases.append(tick.outputs.phase)
         record(self, tick)
 
-    monkeypatch.setattr(lateness._Sink, "tick", tick)
+    monkeypatch.setattr(Recorder, "tick", tick)
     found = lateness.measure(ticks, load_config(), turns=1)
     flown = [(t.index, t.inputs.request) for t in ticks if t.inputs.request is not None and t.index < 250]
     assert requests == flown != []

@@ -13,8 +13,6 @@ from msgspec.structs import replace
 from groundstation.metrics import compute
 from groundstation.run import TRUTH_LASTS, read_run
 from onboard.config import Config, load_config
-from onboard.core.params import Params
-from onboard.core.step import State
 from onboard.core.types import Event, Phase, Severity, Tick
 from onboard.devices import mock_devices, world_of
 from onboard.loop import Loop
@@ -42,21 +40,18 @@ class LateClock:
         self._sleeps += 1
 
 
-class Sink:
-    """Records a loop's ticks, and loses those that are named."""
+class LossyRecorder(Recorder):
+    """Loses what concerns some ticks."""
 
-    def __init__(self, recorder: Recorder, lost: frozenset[int]) -> None:
-        self._recorder, self._lost = recorder, lost
+    lost: frozenset[int] = frozenset()
 
-    def tick(self, tick: Tick) -> None:
-        if tick.index not in self._lost:
-            self._recorder.tick(tick)
-
-    def keyframe(self, index: int, t_ns: int, state: State) -> None: ...
+    def tick(self, tick: Tick, truth: Truth | None = None) -> None:
+        if tick.index not in self.lost:
+            super().tick(tick, truth)
 
     def timing(self, timing: Timing) -> None:
-        if timing.index not in self._lost:
-            self._recorder.timing(timing)
+        if timing.index not in self.lost:
+            super().timing(timing)
 
     def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None: ...
 
@@ -70,8 +65,10 @@ def loop_timing(
     path: Path, config: Config, late: dict[int, int], ticks: int, lost: frozenset[int] = frozenset()
 ) -> dict[str, Any]:
     """The figures of a real loop on a clock that is late, with devices that stand still."""
-    with Recorder(path, INFO, ConfigStub(), "", t_ns=BASE_NS) as recorder:
-        loop = Loop(mock_devices(world_of(config)), LateClock(late), config, Sink(recorder, lost), timed=True)
+    recorder = LossyRecorder(path, INFO, ConfigStub(), "", t_ns=BASE_NS)
+    with recorder:
+        recorder.lost = lost
+        loop = Loop(mock_devices(world_of(config)), LateClock(late), config, recorder, timed=True)
         left = iter(range(ticks - 1, -1, -1))
         asyncio.run(loop.run(lambda outputs: bool(next(left))))
     timing: dict[str, Any] = compute(read_run(path))["timing"]
