@@ -13,6 +13,7 @@ from onboard import attended
 from onboard.clock import WallClock
 from onboard.config import Config, dump_config
 from onboard.core.types import Event, Outputs, Phase, Request, Severity
+from onboard.cpu import CpuMeter
 from onboard.devices import FlightDevices
 from onboard.ending import Ending, hand_over, signals
 from onboard.errand import Errand
@@ -129,6 +130,7 @@ class _Flight:
             for sentence in refused:
                 self._tell(Event(clock.now_ns(), "process", Severity.WARNING, sentence))
             self._first_ns = clock.now_ns()
+            self._cpu = CpuMeter()
             try:
                 with Collector(config.process) as self._collector:
                     await loop.run(self._on_tick)
@@ -137,6 +139,7 @@ class _Flight:
                     self._tell(Event(clock.now_ns(), "handed_over", Severity.WARNING, sentence))
             finally:
                 devices.on_look = None
+                self._cpu.stop()
                 self._reloader.close()
                 self._reloader.join(_JOIN)
         if recorder.error is not None:
@@ -154,7 +157,8 @@ class _Flight:
         self._tell_what_there_is(outputs, now)
         if now >= self._report_ns:
             self._report_ns = now + _REPORT_NS
-            self._recorder.devices(DeviceReport(now, self._devices.statistics()))
+            shares = {f"cpu.{part}": share for part, share in self._cpu.latest().items()}
+            self._recorder.devices(DeviceReport(now, self._devices.statistics() | shares))
         self._collector.tick(outputs.phase)
         return goes_on
 

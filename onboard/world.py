@@ -24,8 +24,9 @@ from onboard.devices import world_of
 from onboard.layers import ConfigError
 from sim_backend.dynamixel_emulator import emulate
 from sim_backend.faults import Fault, Faults, read_faults
-from sim_backend.pace import Face, Pace
+from sim_backend.pace import Crier, Face, Pace
 from sim_backend.px4_emulator import Px4StandIn
+from sim_backend.px4_simulator_link import Px4SimulatorLink
 from sim_backend.tracker import Tracker
 from sim_backend.world_link import WorldServer
 
@@ -33,11 +34,11 @@ from sim_backend.world_link import WorldServer
 class WorldProcess:
     """A world, its faces, and the emulators beside it. Close it to give ports and terminals back.
 
-    ``servo_link`` is a symbolic link to make to the servo bus's terminal. Raises ConfigError for faults that no
+    ``say`` hears what a person should know. ``servo_link`` is a symbolic link to make to the servo bus's terminal. Raises ConfigError for faults that no
     emulator can show, DeviceError for a port that cannot be had.
     """
 
-    def __init__(self, config: Config, servo_link: Path | None = None) -> None:
+    def __init__(self, config: Config, say: Callable[[str], None], servo_link: Path | None = None) -> None:
         kinds, devices = config.devices.kinds(), config.devices
         self._cleanup = ExitStack()
         self._faults: dict[str, Faults] = {}
@@ -55,6 +56,11 @@ class WorldProcess:
                 received = lambda: stand_in.received  # noqa: E731
                 self._faults["autopilot"] = stand_in.faults
                 self.endpoints["devices.autopilot.url"] = f"udpout://127.0.0.1:{stand_in.port}"
+            if devices.simulator:
+                link = Px4SimulatorLink(world, devices.simulator, seed=config.seed)
+                self._cleanup.callback(link.close)
+                faces += [link, Crier(link.notices, say)]
+                received = lambda: link.received  # noqa: E731
             if kinds["servos"] is Kind.EMULATED:
                 bus = devices.servos
                 emulator = emulate(bus.servos, world=world, link=servo_link, baud=bus.baud, faults=config.faults)
@@ -100,7 +106,11 @@ class WorldProcess:
 
 def serve(config: Config, servo_link: Path | None = None) -> None:
     """Hold the world until standard input closes, or SIGINT or SIGTERM comes."""
-    process = WorldProcess(config, servo_link)
+
+    def say(text: str) -> None:
+        sys.stderr.write(f"{text}\n")
+
+    process = WorldProcess(config, say, servo_link)
     pace = process.pace
 
     def stop(*_: Any) -> None:
@@ -111,7 +121,7 @@ def serve(config: Config, servo_link: Path | None = None) -> None:
             for fault in read_faults(line, "standard input"):
                 process.inject(fault)
         except ValueError as error:
-            sys.stderr.write(f"{error}\n")
+            say(str(error))
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
@@ -123,4 +133,4 @@ def serve(config: Config, servo_link: Path | None = None) -> None:
     finally:
         process.close()
     if pace.slipped:
-        sys.stderr.write(f"the simulated world fell behind the wall clock by {pace.slipped:.2f} s\n")
+        say(f"the simulated world fell behind the wall clock by {pace.slipped:.2f} s")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from threading import Event, Thread
 from typing import Protocol
 
+from drivers.mailbox import Notice
 from sim_backend.world import World
 
 #: So far behind, the pace starts anew instead of catching up, s.
@@ -24,6 +25,23 @@ class Face(Protocol):
 
     def publish(self) -> None:
         """Say what is due, now that the world stands at a multiple of ``period``."""
+
+
+class Crier:
+    """A face that says what another has had to tell."""
+
+    period = 0.1
+
+    def __init__(self, notices: Callable[[], Sequence[Notice]], say: Callable[[str], object]) -> None:
+        self._notices, self._say = notices, say
+
+    def receive(self) -> None:
+        """Nothing comes in."""
+
+    def publish(self) -> None:
+        """Say it."""
+        for notice in self._notices():
+            self._say(notice.text)
 
 
 class Pace:

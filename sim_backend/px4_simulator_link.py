@@ -29,7 +29,7 @@ from sim_backend import layout as at
 from sim_backend.autopilot import STOPPED, Rotors
 from sim_backend.knob import knob, switch
 from sim_backend.motors import rated_voltage
-from sim_backend.pace import Pace
+from sim_backend.pace import Crier, Pace
 from sim_backend.px4_sensors import Px4SensorParams, Px4Sensors
 from sim_backend.px4_wire import LostError, wire_of
 from sim_backend.rigid_body import PlantParams
@@ -257,23 +257,6 @@ def _control(value: float) -> float:
 _VEHICLE = Path(__file__).resolve().parent.parent / "configs" / "vehicle.yaml"
 
 
-class _Crier:
-    """A face that prints what the link tells."""
-
-    period = 0.1
-
-    def __init__(self, link: Px4SimulatorLink) -> None:
-        self._link = link
-
-    def receive(self) -> None:
-        """Nothing comes in."""
-
-    def publish(self) -> None:
-        """Print."""
-        for notice in self._link.notices():
-            sys.stderr.write(f"{notice.level}: {notice.text}\n")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """A vehicle on the ground beside a pipe, simulated for a real PX4 until interrupted."""
     parser = argparse.ArgumentParser(prog="python -m sim_backend.px4_simulator_link", description=main.__doc__)
@@ -303,7 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"{link.where}\n")
         sys.stdout.flush()
         link.expect(given.wait)
-        Pace(world, (link, _Crier(link))).run()
+        Pace(world, (link, Crier(link.notices, lambda text: sys.stderr.write(f"{text}\n")))).run()
     except DeviceError as error:
         sys.stderr.write(f"{error}\n")
         return 2
