@@ -78,8 +78,6 @@ class _Recorder(Recorder):
         super().timing(timing)
         self.late_ns.append(max(0, round(1e9 * timing.late)))
 
-    def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None: ...
-
 
 def measure(ticks: Sequence[Tick], config: Config, turns: int = 4) -> Lateness:
     """Run the loop over the first ticks of a mission; ``turns`` of one second each for the loop and for the timer."""

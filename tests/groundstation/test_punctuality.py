@@ -54,8 +54,6 @@ class LossyRecorder(Recorder):
         if timing.index not in self.lost:
             super().timing(timing)
 
-    def revision(self, index: int, t_ns: int, revision: int, config: Params) -> None: ...
-
 
 @pytest.fixture(scope="module")
 def config() -> Config:
