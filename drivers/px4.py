@@ -12,13 +12,15 @@ import asyncio
 from collections.abc import Callable, Coroutine
 from enum import IntEnum
 from functools import cache
-from math import isfinite, nan
+from math import dist, isfinite, nan
+from pathlib import Path
 from time import monotonic_ns
 from typing import Annotated, Any
 
 import mavsdk
 import msgspec
 from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
+from mavsdk.plugins.param import Param, ParamError
 from msgspec import Meta, Struct
 
 from drivers.frames import (
@@ -31,6 +33,7 @@ from drivers.frames import (
 )
 from drivers.mailbox import Level, Mailbox, MailboxCounts, Notice, Notices
 from drivers.protocols import DeviceError
+from drivers.px4_parameters import INT32, Value, bits_of_float, differences, read_parameter_file
 from drivers.rotation import inverse, rotate
 from drivers.samples import (
     AutopilotCommand,
@@ -81,6 +84,7 @@ class Motion(Struct, frozen=True, gc=False):
 
 
 class _AttitudeQuaternion(Struct, gc=False):
+    time_boot_ms: int
     q1: float
     q2: float
     q3: float
@@ -139,6 +143,13 @@ class _Timesync(Struct, gc=False):
 
 class _CommandAck(Struct, gc=False):
     result: int
+
+
+class _ParamValue(Struct, gc=False):
+    param_id: str
+    param_type: int
+    param_value: float | None
+    """None: not finite, as the bits of some whole numbers are."""
 
 
 class _Attitude(Struct, frozen=True, gc=False):
@@ -220,6 +231,9 @@ _ASK_AGAIN_NS = 1_000_000_000
 _FRESH_NS = 200_000_000
 _RATE_CHECK_NS = 3_000_000_000
 _RATE_TOLERANCE = 0.8
+_REBOOT_MS = 1000  # PX4's time does not go back further than packets can overtake each other
+_PARAMETER_ROUNDS = 4  # so many times a parameter is asked for
+_PARAMETER_PATIENCE = 0.5  # s without an answer, after which a round ends
 
 
 class Px4:
@@ -262,11 +276,13 @@ class Px4:
         self._texts: dict[int, str] = {}
 
         self._hub: Any = None
+        self._param: Any = None
         self._direct: Any = None
         self._task: asyncio.Task[None] | None = None
         self._asking: set[asyncio.Task[None]] = set()
         self._tuning: asyncio.Task[None] | None = None
         self._linked = True
+        self._boot_ms = 0
         self._intervals_due = False
         self._slow: set[str] = set()
         self._rates_checked_ns = 0
@@ -281,13 +297,20 @@ class Px4:
         self._sent = 0
         self._vision_due_ns = 0
         self._vision_sent = 0
+        self._wanted_parameters: dict[str, Value] = {}
+        self._held: dict[str, Value] = {}
+        self._whole: set[str] = set()
+        self._differences: tuple[str, ...] = ()
+        self._parameters_due = False
+        self._comparing: asyncio.Task[None] | None = None
 
     # -- life cycle -----------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Connect, subscribe, and wait until everything that ``latest`` needs has come once.
+        """Connect, subscribe, wait until everything that ``latest`` needs has come once, and compare the parameters.
 
-        Raises DeviceError: bad URL, port taken, nobody there, not a PX4, or a message that never comes.
+        Raises DeviceError: bad URL or parameter file, port taken, nobody there, not a PX4, or a message that never
+        comes. Parameters that differ are no error (``parameter_differences``).
         """
         try:
             await self._start()
@@ -299,6 +322,11 @@ class Px4:
         url, timeout = self._settings.url, self._settings.timeout
         if not url:
             raise DeviceError(f"autopilot: no URL of PX4 in the settings; {_WANTED_URL}")
+        if self._settings.parameters:
+            try:
+                self._wanted_parameters = read_parameter_file(Path(self._settings.parameters))
+            except ValueError as error:
+                raise DeviceError(f"autopilot: {error}") from error
         loop = asyncio.get_running_loop()
         _hush()
         # The onboard computer shares the vehicle's system id, as PX4 expects of a companion.
@@ -338,6 +366,7 @@ class Px4:
 
         system.subscribe_is_connected(self._on_link)
         self._direct = MavlinkDirect(system)
+        self._param = Param(system)
         self._subscribe("ATTITUDE_QUATERNION", _AttitudeQuaternion, self._on_attitude)
         self._subscribe("HIGHRES_IMU", _HighresImu, self._on_imu)
         self._subscribe("LOCAL_POSITION_NED", _LocalPosition, self._on_motion)
@@ -347,8 +376,10 @@ class Px4:
         self._subscribe("SYS_STATUS", _SysStatus, self._on_health)
         self._subscribe("STATUSTEXT", _StatusText, self._on_text)
         self._subscribe("TIMESYNC", _Timesync, self._on_timesync)
+        self._subscribe("PARAM_VALUE", _ParamValue, self._on_parameter)
         await self._ask_intervals()
         await self._wait_for_samples()
+        await self._compare_parameters()
         self._rates_checked_ns = self._clock()
         self._task = asyncio.create_task(self._work(), name="px4")
 
@@ -463,6 +494,29 @@ class Px4:
         """PX4's own pre-arm checks pass."""
         return self._health.latest() or False
 
+    def vision_disagreement(self, sample: Odometry) -> float | None:
+        """Distance, m, between PX4's own position and this pose; None while PX4 tells no fresh position.
+
+        Both are of the body origin, in W's axes; what the vehicle flew between their times is taken into account.
+        """
+        motion = self._motion.latest()
+        if motion is None or self._clock() - motion.t_ns > _FRESH_NS:
+            return None
+        ahead = (motion.t_ns - sample.t_ns) * 1e-9
+        moved = (sample.p_WB[i] + ahead * motion.v_WB[i] for i in range(3))
+        return dist(motion.p_WB, tuple(moved))
+
+    def parameter_differences(self) -> tuple[str, ...]:
+        """What PX4 held otherwise than the file of the settings when it was read last; empty: nothing, or no file.
+
+        It is read at the start, after each return of the link, and on ``read_parameters``.
+        """
+        return self._differences
+
+    def read_parameters(self) -> None:
+        """Read PX4's parameters anew, soon. Until then the last comparison stands."""
+        self._parameters_due = True
+
     def notices(self) -> tuple[Notice, ...]:
         """Sentences since the last call: PX4's status texts, refusals, loss and return of the link."""
         return self._told.take()
@@ -525,6 +579,9 @@ class Px4:
             if self._intervals_due and self._linked and (self._tuning is None or self._tuning.done()):
                 self._intervals_due = False
                 self._tuning = self._begin(self._ask_intervals())
+            if self._parameters_due and self._linked and (self._comparing is None or self._comparing.done()):
+                self._parameters_due = False
+                self._comparing = self._begin(self._compare_parameters())
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Do it beside everything else: an answer that is late must not keep the next question back."""
@@ -596,6 +653,39 @@ class Px4:
             ask = _Ask(f"{name} at {rate:g} Hz", _Command.SET_MESSAGE_INTERVAL, (float(number), round(1e6 / rate)))
             await self._try(ask)
 
+    async def _compare_parameters(self) -> None:
+        """Read the parameters of the file from PX4, and tell in how many they differ."""
+        wanted = self._wanted_parameters
+        if not wanted:
+            return
+        self._held.clear()
+        self._whole.clear()
+        for _ in range(_PARAMETER_ROUNDS):
+            missing = [name for name in wanted if name not in self._held and name not in self._whole]
+            for name in missing:
+                self._send("PARAM_REQUEST_READ", _parameter_json(name))
+            quiet, left = 0.0, len(missing)
+            while left and quiet < _PARAMETER_PATIENCE and self._direct is not None:
+                await asyncio.sleep(_PERIOD)
+                now_left = sum(name not in self._held and name not in self._whole for name in missing)
+                quiet, left = (quiet + _PERIOD if now_left == left else 0.0), now_left
+        for name in self._whole.difference(self._held):
+            # JSON has no words for the bits of this whole number; MAVSDK's own reader has.
+            try:
+                self._held[name] = await asyncio.to_thread(self._param.get_param_int, name)
+            except ParamError as error:
+                self._tell(Level.WARNING, f"PX4's {name} cannot be read: {error}")
+        before, self._differences = self._differences, differences(wanted, self._held)
+        if self._differences:
+            if self._differences != before:
+                self._tell(
+                    Level.ERROR,
+                    f"PX4 differs from {self._settings.parameters} in {len(self._differences)} of {len(wanted)} "
+                    f"parameters: {'; '.join(self._differences)}",
+                )
+        else:
+            self._tell(Level.INFO, f"PX4 holds the {len(wanted)} parameters of {self._settings.parameters}")
+
     def _judge_rates(self) -> None:
         now = self._clock()
         if now - self._rates_checked_ns < _RATE_CHECK_NS or not self._linked:
@@ -635,6 +725,10 @@ class Px4:
         self._direct.subscribe_message(name, on_message)
 
     def _on_attitude(self, m: _AttitudeQuaternion, now: int) -> None:
+        if m.time_boot_ms < self._boot_ms - _REBOOT_MS:
+            self._intervals_due = self._parameters_due = True
+            self._tell(Level.ERROR, "PX4 has rebooted: its time began anew")
+        self._boot_ms = m.time_boot_ms
         attitude = attitude_from_px4((m.q1, m.q2, m.q3, m.q4))
         self._attitude.put(_Attitude(now, attitude, body_from_px4((m.rollspeed, m.pitchspeed, m.yawspeed))), now)
 
@@ -682,12 +776,22 @@ class Px4:
                 f'{{"tc1":{now},"ts1":{m.ts1},"target_system":{_SYSTEM},"target_component":{_AUTOPILOT}}}',
             )
 
+    def _on_parameter(self, m: _ParamValue, now: int) -> None:
+        name = m.param_id.rstrip("\0")
+        if m.param_type != INT32:
+            if m.param_value is not None:
+                self._held[name] = m.param_value
+        elif m.param_value is None:
+            self._whole.add(name)
+        else:
+            self._held[name] = bits_of_float(m.param_value)
+
     def _on_link(self, connected: bool, _: object) -> None:
         if connected == self._linked:
             return
         self._linked = connected
         if connected:
-            self._intervals_due = True
+            self._intervals_due = self._parameters_due = True
             self._tell(Level.WARNING, "the link to PX4 is back")
         else:
             self._tell(Level.ERROR, "the link to PX4 is lost: no heartbeat")
@@ -720,6 +824,10 @@ def _covariance(linear: float, angular: float | None) -> str:
     """The upper right triangle, row by row, of a diagonal 6x6 matrix; None is not known (NaN on the wire)."""
     a, b = f"{linear}", "null" if angular is None else f"{angular}"
     return f"[{a},0,0,0,0,0,{a},0,0,0,0,{a},0,0,0,{b},0,0,{b},0,{b}]"
+
+
+def _parameter_json(name: str) -> str:
+    return f'{{"target_system":{_SYSTEM},"target_component":{_AUTOPILOT},"param_id":"{name}","param_index":-1}}'
 
 
 def _command_json(ask: _Ask) -> str:

@@ -30,12 +30,15 @@ from sim_backend.px4_simulator_link import Px4SimulatorLink
 from sim_backend.tracker import Tracker
 from sim_backend.world_link import WorldServer
 
+#: After which the thread of one emulator hands the interpreter to another's, s: each answers within milliseconds.
+SWITCH_INTERVAL = 0.0005
+
 
 class WorldProcess:
     """A world, its faces, and the emulators beside it. Close it to give ports and terminals back.
 
-    ``say`` hears what a person should know. ``servo_link`` is a symbolic link to make to the servo bus's terminal. Raises ConfigError for faults that no
-    emulator can show, DeviceError for a port that cannot be had.
+    ``say`` hears what a person should know. ``servo_link`` is a symbolic link to make to the servo bus's terminal.
+    Raises ConfigError for faults that no emulator can show, DeviceError for a port that cannot be had.
     """
 
     def __init__(self, config: Config, say: Callable[[str], None], servo_link: Path | None = None) -> None:
@@ -112,6 +115,7 @@ def serve(config: Config, servo_link: Path | None = None) -> None:
 
     process = WorldProcess(config, say, servo_link)
     pace = process.pace
+    sys.setswitchinterval(SWITCH_INTERVAL)
 
     def stop(*_: Any) -> None:
         pace.stop()

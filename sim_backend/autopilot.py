@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from math import inf, isfinite
+from collections.abc import Sequence
+from math import hypot, inf, isfinite
 from typing import Annotated
 
 import numpy as np
@@ -25,7 +26,7 @@ class AutopilotParams(Struct, frozen=True, forbid_unknown_fields=True):
     wrench_delay: Annotated[float, knob("s", "set-point to mixer, wrench", 0.0, 0.2)] = 0.0
     arm_delay: Annotated[float, knob("s", "stream of set-points needed before arming and offboard", 0.0, 5.0)] = 0.5
     offboard_timeout: Annotated[float, knob("s", "COM_OF_LOSS_T: silence after which it lands", 0.1, 5.0)] = 0.5
-    descent_speed: Annotated[float, knob("m/s", "speed of its own landing", 0.1, 2.0)] = 0.5
+    descent_speed: Annotated[float, knob("m/s", "MPC_LAND_SPEED: speed of its own landing", 0.1, 2.0)] = 0.6
     landed_time: Annotated[float, knob("s", "rest on the skids for this long counts as landed", 0.05, 5.0)] = 0.3
     landed_speed: Annotated[float, knob("m/s", "slower than this counts as rest", 0.01, 1.0)] = 0.1
     disarm_delay: Annotated[float, knob("s", "COM_DISARM_LAND: from landed to disarmed in mode LAND", 0.0, 10.0)] = 1.0
@@ -46,6 +47,10 @@ class Descent(Struct, frozen=True, gc=False):
     """The autopilot flies by itself: no horizontal velocity, heading kept, down at ``speed`` m/s (0: hover)."""
 
     speed: float
+    blind: bool = False
+    """It does not know its horizontal velocity and keeps level instead."""
+    error: Vec3 = (0.0, 0.0, 0.0)
+    """Of the velocity it believes in, m/s, W."""
 
 
 class Rotors(Struct, frozen=True, gc=False):
@@ -69,8 +74,9 @@ def _drive(u: Array, demand: SetPoint | Descent | Rotors | None) -> None:
         u[at.U_SETPOINT] = loops.ROTORS
         u[at.U_ROTOR : at.U_ROTOR + 4] = demand.thrust
     elif isinstance(demand, Descent):
-        u[at.U_SETPOINT] = loops.VELOCITY
+        u[at.U_SETPOINT] = loops.DESCENT if demand.blind else loops.VELOCITY
         u[at.U_THRUST] = demand.speed
+        u[at.U_VELOCITY_ERROR : at.U_VELOCITY_ERROR + 3] = demand.error
     else:
         u[at.U_SETPOINT] = _KINDS[demand.interface]
         u[at.U_THRUST] = demand.thrust
@@ -160,18 +166,17 @@ class Autopilot:
         """Time at which the next pending set-point falls due, s; infinity when none is pending."""
         return self._pending[0][0] if self._pending else inf
 
-    def update(self, t: float, on_ground: bool, speed: float, u: Array) -> None:
-        """Land detector, failsafe, disarming after landing, and the set-point that is due at ``t``."""
-        params = self.params
-        self._detect_land(t, on_ground, speed)
+    def update(self, t: float, x: Sequence[float], u: Array) -> None:
+        """Land detector, failsafe, disarming after landing, and the set-point that is due at ``t``.
+
+        ``x`` is the world's state now; of ``u``, the demand of the loops, it sets what they shall follow.
+        """
+        self._detect_land(t, x, u)
         if self._rotors is not None:
             _drive(u, self._rotors)
             return
-        if self.armed and self.mode is FlightMode.OFFBOARD and t - self._stream_last > params.offboard_timeout:
-            self.mode = FlightMode.LAND
-        landed = self.landed is Landed.ON_GROUND
-        if self.armed and self.mode is FlightMode.LAND and landed and t - self._landed_at >= params.disarm_delay:
-            self._stop()
+        self._fail_safe(t)
+        self._disarm_landed(t)
         while self._pending and self._pending[0][0] <= t + 1e-9:
             self._setpoint = self._pending.popleft()[1]
         if not self.armed:
@@ -179,12 +184,26 @@ class Autopilot:
         elif self.mode is FlightMode.OFFBOARD:
             _drive(u, self._setpoint)
         else:
-            _drive(u, Descent(params.descent_speed if self.mode is FlightMode.LAND else 0.0))
+            _drive(u, self._own_flight(t))
 
-    def _detect_land(self, t: float, on_ground: bool, speed: float) -> None:
+    def _fail_safe(self, t: float) -> None:
+        if self.armed and self.mode is FlightMode.OFFBOARD and t - self._stream_last > self.params.offboard_timeout:
+            self.mode = FlightMode.LAND
+
+    def _disarm_landed(self, t: float) -> None:
+        landed = self.landed is Landed.ON_GROUND
+        if self.armed and self.mode is FlightMode.LAND and landed and t - self._landed_at >= self.params.disarm_delay:
+            self._stop()
+
+    def _own_flight(self, t: float) -> Descent:
+        """How it flies in its own modes."""
+        return Descent(self.params.descent_speed if self.mode is FlightMode.LAND else 0.0)
+
+    def _detect_land(self, t: float, x: Sequence[float], u: Array) -> None:
+        on_ground = x[at.ON_GROUND] != 0.0
         if not on_ground:
             self.landed = Landed.IN_AIR
-        if not on_ground or speed > self.params.landed_speed:
+        if not on_ground or speed_of(x) > self.params.landed_speed:
             self._rest_since = None
             return
         if self._rest_since is None:
@@ -192,3 +211,8 @@ class Autopilot:
         if self.landed is not Landed.ON_GROUND and t - self._rest_since >= self.params.landed_time:
             self.landed = Landed.ON_GROUND
             self._landed_at = t
+
+
+def speed_of(x: Sequence[float]) -> float:
+    """Speed of the body origin, m/s."""
+    return hypot(x[at.VELOCITY], x[at.VELOCITY + 1], x[at.VELOCITY + 2])

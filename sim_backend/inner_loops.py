@@ -23,7 +23,7 @@ Three = tuple[float, float, float]
 Four = tuple[float, float, float, float]
 
 #: What ``u[U_SETPOINT]`` says.
-NONE, WRENCH, ATTITUDE, BODY_RATE, VELOCITY, ROTORS = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0
+NONE, WRENCH, ATTITUDE, BODY_RATE, VELOCITY, DESCENT, ROTORS = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0
 
 
 class LoopParams(Struct, frozen=True, forbid_unknown_fields=True):
@@ -205,12 +205,18 @@ def rate_torque(x: Array, p: Array, dx: float, dy: float, dz: float) -> Three:
 
 @compiled()
 def _fly_by_velocity(x: Array, p: Array, u: Array) -> tuple[float, float, float, float, float]:
-    """Thrust (N) and attitude set-point for a velocity: level flight at ``-u[U_THRUST]`` m/s upwards, yaw kept."""
+    """Thrust (N) and attitude set-point for a velocity: no drift, ``-u[U_THRUST]`` m/s upwards, yaw kept.
+
+    A descent is flown level, whatever the drift. Velocities are those that the autopilot believes in.
+    """
     gain = p[at.LOOP_VELOCITY_GAIN]
     g = p[at.GRAVITY]
-    ax = min(max(-gain * x[at.VELOCITY], -0.3 * g), 0.3 * g)
-    ay = min(max(-gain * x[at.VELOCITY + 1], -0.3 * g), 0.3 * g)
-    az = g + min(max(gain * (-u[at.U_THRUST] - x[at.VELOCITY + 2]), -0.3 * g), 0.3 * g)
+    ax = ay = 0.0
+    if u[at.U_SETPOINT] == VELOCITY:
+        ax = min(max(-gain * (x[at.VELOCITY] + u[at.U_VELOCITY_ERROR]), -0.3 * g), 0.3 * g)
+        ay = min(max(-gain * (x[at.VELOCITY + 1] + u[at.U_VELOCITY_ERROR + 1]), -0.3 * g), 0.3 * g)
+    climb = x[at.VELOCITY + 2] + u[at.U_VELOCITY_ERROR + 2]
+    az = g + min(max(gain * (-u[at.U_THRUST] - climb), -0.3 * g), 0.3 * g)
     length = sqrt(ax * ax + ay * ay + az * az)
     # Shortest turn from +z of W to the thrust's direction, after a turn about z by the present heading.
     tw = sqrt(0.5 * (1.0 + az / length))
@@ -252,7 +258,7 @@ def inner_loops(x: Array, p: Array, u: Array) -> None:
             dx = u[at.U_ATTITUDE + 1]
             dy = u[at.U_ATTITUDE + 2]
             dz = u[at.U_ATTITUDE + 3]
-            if kind == VELOCITY:
+            if kind in (VELOCITY, DESCENT):
                 thrust, dw, dx, dy, dz = _fly_by_velocity(x, p, u)
             rx, ry, rz = attitude_rate(
                 p, x[at.ATTITUDE], x[at.ATTITUDE + 1], x[at.ATTITUDE + 2], x[at.ATTITUDE + 3], dw, dx, dy, dz

@@ -6,13 +6,11 @@ PIPEWRIGHT_PX4 may name. PX4 then looks for its simulator on TCP ``4560 + instan
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import subprocess
-import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import ceil, hypot, isfinite
+from math import ceil, isfinite
 
 import numpy as np
 from msgspec import Struct
@@ -126,8 +126,7 @@ class World:
         state = self.snapshot.x
         while left:
             t = plant.time
-            speed = hypot(state[at.VELOCITY], state[at.VELOCITY + 1], state[at.VELOCITY + 2])
-            self.autopilot.update(t, state[at.ON_GROUND] != 0.0, speed, u)
+            self.autopilot.update(t, state, u)
             until = (self.autopilot.next_change() - t) / step
             count = min(left, longest)
             if until < count:

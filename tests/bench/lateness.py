@@ -15,7 +15,6 @@ from msgspec.structs import replace
 
 from onboard.clock import WallClock
 from onboard.config import Config, dump_config
-from onboard.core.params import Params
 from onboard.core.types import Outputs, Tick
 from onboard.loop import Loop
 from onboard.recorder import Recorder

@@ -21,6 +21,7 @@ from drivers.px4 import Px4, Px4Settings
 from drivers.samples import AutopilotCommand, Engage, FlightMode, Interface, Odometry, Quat, Vec3
 from drivers.thrust import ThrustMap
 from drivers.vehicle import Vehicle
+from sim_backend.px4_commander import Severity
 from sim_backend.px4_emulator import Px4StandIn
 from sim_backend.world import World
 
@@ -110,8 +111,8 @@ async def test_a_taken_port() -> None:
 
 async def test_a_message_that_never_comes() -> None:
     stand_in = Px4StandIn(World(VEHICLE))
-    del stand_in._makers[147]  # no battery monitor
-    stand_in._intervals.pop(147)
+    del stand_in.streams.makers[147]  # no battery monitor
+    stand_in.streams.intervals.pop(147)
     stand_in.start()
     px4 = Px4(settings(f"udpout://127.0.0.1:{stand_in.port}", timeout=1.5))
     try:
@@ -312,14 +313,14 @@ async def test_offboard_is_not_taken_back_from_a_pilot(pair: tuple[Px4, Px4Stand
 
 async def test_a_refusal_is_told_with_px4s_reason(pair: tuple[Px4, Px4StandIn]) -> None:
     px4, stand_in = pair
-    stand_in._terminated = True
+    stand_in.commander.terminated = True
     told: list[str] = []
 
     def tick() -> None:
         px4.command(command())
         told.extend(n.text for n in px4.notices())
 
-    want = {"autopilot: arming: temporarily rejected", "PX4: Arming denied: flight terminated"}
+    want = {"autopilot: arming: temporarily rejected", "PX4: Preflight Fail: Flight termination active"}
     await until(lambda: want <= set(told), tick)
 
 
@@ -348,7 +349,7 @@ async def test_loss_and_return_of_the_link() -> None:
             assert stale is not None
             assert fresh is not None
             await until(lambda: px4.counts()["ATTITUDE_QUATERNION"].rate > 200.0)
-            assert second._intervals[31] == pytest.approx(0.004)
+            assert second.streams.intervals[31] == pytest.approx(0.004)
         finally:
             await px4.stop()
             second.stop()
@@ -369,14 +370,14 @@ async def test_start_again_after_stop(pair: tuple[Px4, Px4StandIn]) -> None:
 
 async def test_a_number_that_is_not_finite_is_rejected(pair: tuple[Px4, Px4StandIn]) -> None:
     px4, stand_in = pair
-    make = stand_in._makers[31]
+    make = stand_in.streams.makers[31]
 
     def broken() -> object:
         message = make()
         message.q1 = nan
         return message
 
-    stand_in._makers[31] = broken
+    stand_in.streams.makers[31] = broken
     await until(lambda: px4.counts()["ATTITUDE_QUATERNION"].rejected > 10)
     latest = px4.latest()
     assert latest is not None
@@ -386,7 +387,7 @@ async def test_a_number_that_is_not_finite_is_rejected(pair: tuple[Px4, Px4Stand
 async def test_long_status_texts_are_joined(pair: tuple[Px4, Px4StandIn]) -> None:
     px4, stand_in = pair
     text = "".join(chr(97 + i % 26) for i in range(130))
-    stand_in._say(4, text)
+    stand_in._say(Severity.WARNING, text)
     told: list[tuple[Level, str]] = []
     await until(lambda: bool(told), lambda: told.extend((n.level, n.text) for n in px4.notices() if "abc" in n.text))
     assert told == [(Level.WARNING, f"PX4: {text}")]
@@ -402,8 +403,8 @@ async def test_a_rate_that_has_fallen_is_told_once_and_asked_for_again(pair: tup
 
     await until(lambda: px4.counts()["ATTITUDE_QUATERNION"].rate > 200.0, listen)
     told.clear()
-    stand_in._intervals[31] = 0.02
+    stand_in.streams.intervals[31] = 0.02
     await until(lambda: bool(told), listen)
-    await until(lambda: stand_in._intervals[31] == pytest.approx(0.004), listen)
+    await until(lambda: stand_in.streams.intervals[31] == pytest.approx(0.004), listen)
     assert len(told) == 1
     assert "asked for 250 Hz; asking again" in told[0]

@@ -13,7 +13,6 @@ from msgspec.structs import replace
 from groundstation.metrics import compute
 from groundstation.run import TRUTH_LASTS, read_run
 from onboard.config import Config, load_config
-from onboard.core.params import Params
 from onboard.core.types import Event, Phase, Severity, Tick
 from onboard.devices import mock_devices, world_of
 from onboard.loop import Loop

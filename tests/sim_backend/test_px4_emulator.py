@@ -6,87 +6,38 @@ import struct
 from collections.abc import Iterator
 from math import nan
 from socket import AF_INET, SOCK_DGRAM, socket
-from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from drivers.protocols import DeviceError
+from drivers.px4_parameters import read_parameter_file
 from drivers.samples import FlightMode, Landed
 from drivers.vehicle import Vehicle
+from sim_backend import layout as at
+from sim_backend.px4_commander import Severity
 from sim_backend.px4_emulator import Px4StandIn
+from sim_backend.px4_parameters import FILE
 from sim_backend.world import World
-
-ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
-ARM, SET_MODE, TERMINATE, INTERVAL, REQUEST = 400, 176, 185, 511, 512
-OFFBOARD, HOLD, LAND = (1.0, 6.0, 0.0), (1.0, 4.0, 3.0), (1.0, 4.0, 6.0)
-FORCE = 21196.0
-LEVEL_EAST = (0.5**0.5, 0.0, 0.0, 0.5**0.5)  # PX4's quaternion of the identity in W
-LEVEL_RATES, LEVEL_ATTITUDE = 128, 7
-
-
-class Client:
-    """A plain MAVLink client of one stand-in."""
-
-    def __init__(self, stand_in: Px4StandIn) -> None:
-        self.stand_in = stand_in
-        self.world = stand_in.world
-        self.socket = socket(AF_INET, SOCK_DGRAM)
-        self.socket.setblocking(False)
-        self.socket.bind(("127.0.0.1", 0))
-        self.mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
-        self.parser = mavlink.MAVLink(None)
-        self.seen: list[Any] = []
-        self.send(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
-
-    def send(self, message: Any) -> None:
-        self.socket.sendto(message.pack(self.mav), ("127.0.0.1", self.stand_in.port))
-
-    def run(self, seconds: float, thrust: float | None = None, mask: int = LEVEL_RATES) -> list[Any]:
-        """Step the stand-in, with a set-point before each step if a thrust is given; what it said meanwhile."""
-        seen: list[Any] = []
-        for _ in range(round(seconds / self.stand_in.period)):
-            if thrust is not None:
-                self.send(mavlink.MAVLink_set_attitude_target_message(0, 1, 1, mask, LEVEL_EAST, 0.0, 0.0, 0.0, thrust))
-            self.stand_in.step()
-            seen += self.receive()
-        self.seen += seen
-        return seen
-
-    def receive(self) -> list[Any]:
-        messages: list[Any] = []
-        while True:
-            try:
-                data = self.socket.recv(4096)
-            except BlockingIOError:
-                return messages
-            messages += self.parser.parse_buffer(data) or []
-
-    def command(self, command: int, *params: float) -> int:
-        """Result of one COMMAND_LONG."""
-        padded = (*params, *(nan,) * (7 - len(params)))
-        self.send(mavlink.MAVLink_command_long_message(1, 1, command, 0, *padded))
-        (ack,) = [m for m in self.run(0.004) if m.get_type() == "COMMAND_ACK"]
-        assert ack.command == command
-        assert (ack.target_system, ack.target_component) == (1, 191)
-        return int(ack.result)
-
-    def mode(self) -> FlightMode:
-        return self.world.autopilot.mode
-
-    def armed(self) -> bool:
-        return self.world.autopilot.armed
-
-    def texts(self) -> list[str]:
-        return [m.text for m in self.seen if m.get_type() == "STATUSTEXT"]
-
-    def fly(self) -> None:
-        """Arm in offboard and climb off the ground."""
-        self.run(0.6, 0.3)
-        assert self.command(SET_MODE, *OFFBOARD) == ACCEPTED
-        assert self.command(ARM, 1.0) == ACCEPTED
-        self.run(1.2, 0.4)
-        assert self.world.truth().p_WB[2] > 0.4
+from tests.sim_backend.px4_client import (
+    ACCEPTED,
+    ARM,
+    DENIED,
+    FAILED,
+    FORCE,
+    INTERVAL,
+    LAND,
+    LEVEL_EAST,
+    LEVEL_RATES,
+    OFFBOARD,
+    REJECTED,
+    REQUEST,
+    SET_MODE,
+    TERMINATE,
+    UNSUPPORTED,
+    Client,
+    of,
+)
 
 
 @pytest.fixture
@@ -96,10 +47,6 @@ def client(vehicle: Vehicle) -> Iterator[Client]:
     yield client
     client.socket.close()
     stand_in.stop()
-
-
-def of(messages: list[Any], name: str) -> list[Any]:
-    return [m for m in messages if m.get_type() == name]
 
 
 def test_heartbeat_is_a_px4(client: Client) -> None:
@@ -116,7 +63,7 @@ def test_attitude_and_imu_in_the_wire_frames(client: Client) -> None:
     assert (attitude.q1, attitude.q2, attitude.q3, attitude.q4) == pytest.approx(LEVEL_EAST, abs=1e-3)
     assert (imu.xacc, imu.yacc, imu.zacc) == pytest.approx((0.0, 0.0, -9.80665), abs=0.01)
     position = of(seen, "LOCAL_POSITION_NED")[-1]
-    assert position.z == pytest.approx(-client.world.truth().p_WB[2], abs=1e-4)
+    assert (position.x, position.y, position.z) == pytest.approx((0.0, 0.0, 0.0), abs=1e-4)  # where it was switched on
 
 
 def test_asked_rates_are_kept_in_the_mean(client: Client) -> None:
@@ -145,14 +92,44 @@ def test_message_on_request(client: Client) -> None:
     assert version.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
 
 
-def test_offboard_needs_a_stream_first(client: Client) -> None:
-    assert client.command(SET_MODE, *OFFBOARD) == REJECTED
-    assert any("offboard" in text for text in client.texts())
-    client.run(0.6, 0.3)
+def test_offboard_needs_a_stream(client: Client) -> None:
+    """Disarmed, the mode can be chosen, but not armed in without set-points; armed, not even chosen."""
     assert client.command(SET_MODE, *OFFBOARD) == ACCEPTED
-    client.run(0.7)
     assert client.command(ARM, 1.0) == REJECTED
-    assert any("no offboard signal" in text for text in client.texts())
+    assert client.texts() == [
+        "Preflight Fail: No offboard signal",
+        "Arming denied: Resolve system health failures first",
+    ]
+    client.run(0.1, 0.3)
+    assert client.command(ARM, 1.0) == ACCEPTED
+    client.sees = True
+    client.run(0.3, 0.3)
+    assert client.command(SET_MODE, *LAND) == ACCEPTED
+    client.run(0.7)
+    assert client.command(SET_MODE, *OFFBOARD) == REJECTED
+    assert client.texts()[-1] == "Switching to Offboard is currently not available"
+
+
+def test_hold_wants_a_global_position_to_arm(client: Client) -> None:
+    """As in PX4: nobody arms in Hold on vision alone, and attitude offboard does without vision."""
+    client.sees = True
+    client.run(0.2)
+    assert client.command(ARM, 1.0) == REJECTED
+    assert "Preflight Fail: Navigation error: No valid global position estimate" in client.told()
+    client.send(mavlink.MAVLink_set_gps_global_origin_message(1, 473977000, 85456000, 400000))
+    assert client.command(ARM, 1.0) == ACCEPTED
+
+
+def test_prearm_check_follows_the_mode(client: Client) -> None:
+    def passes() -> bool:
+        assert client.command(REQUEST, 1) == ACCEPTED
+        healthy = of(client.seen, "SYS_STATUS")[-1].onboard_control_sensors_health
+        return bool(healthy & mavlink.MAV_SYS_STATUS_PREARM_CHECK)
+
+    assert not passes()
+    assert client.command(SET_MODE, *OFFBOARD) == ACCEPTED
+    client.run(0.1, 0.3)
+    assert passes()
 
 
 def test_thrust_is_what_was_asked(client: Client) -> None:
@@ -164,17 +141,140 @@ def test_thrust_is_what_was_asked(client: Client) -> None:
 
 
 def test_silence_lands_and_disarms(client: Client) -> None:
+    client.sees = True
     client.fly()
     client.run(0.45)
     assert client.mode() is FlightMode.OFFBOARD
     client.run(0.15)
     assert client.mode() is FlightMode.LAND
-    assert any("offboard signal lost" in text for text in client.texts())
+    assert "Failsafe activated: switching to Land (No offboard signal)" in client.told()
     client.run(8.0)
+    assert client.texts()[-2:] == ["Landing detected", "Disarmed by landing"]
     assert client.world.autopilot.landed is Landed.ON_GROUND
     assert not client.armed()
     assert not client.world.truth().crashed
-    assert client.command(ARM, 1.0) == REJECTED  # mode land
+    assert client.command(ARM, 1.0) == REJECTED
+    assert "Preflight Fail: Mode not suitable for arming" in client.texts()
+
+
+def test_silence_without_vision_descends_level(client: Client) -> None:
+    """Land wants a local position; Descend keeps level and drifts, and comes down all the same."""
+    client.fly()
+    client.world.plant.x[at.VELOCITY] = 0.5
+    client.run(0.6)
+    assert "Failsafe activated: Autopilot disengaged, switching to Descend (No offboard signal)" in client.told()
+    client.run(1.0)
+    truth = client.world.truth()
+    assert truth.v_WB[0] > 0.4  # nobody stops it
+    assert truth.v_WB[2] < -0.3
+    client.run(8.0)
+    assert not client.armed()
+
+
+@pytest.mark.parametrize(
+    ("action", "mode", "armed", "word"),
+    [
+        (0, FlightMode.LAND, True, "to Land"),  # Position wants sticks, and NAV_RCL_ACT is Land
+        (3, FlightMode.LAND, True, "to Land"),  # Return wants a home
+        (4, FlightMode.LAND, True, "to Land"),
+        (5, FlightMode.LAND, True, "to Land"),  # Hold wants a global position
+        (6, FlightMode.OFFBOARD, False, "Flight termination active"),
+        (7, FlightMode.OFFBOARD, False, "Disarmed by failsafe"),
+    ],
+)
+def test_what_is_done_about_silence(vehicle: Vehicle, action: int, mode: FlightMode, armed: bool, word: str) -> None:
+    stand_in = Px4StandIn(World(vehicle), parameters={"COM_OBL_RC_ACT": action})
+    client = Client(stand_in)
+    client.sees = True
+    try:
+        client.fly()
+        client.run(0.6)
+        assert (client.mode(), client.armed()) == (mode, armed)
+        assert any(word in text for text in client.texts())
+    finally:
+        client.socket.close()
+        stand_in.stop()
+
+
+def test_hold_with_a_global_position(vehicle: Vehicle) -> None:
+    stand_in = Px4StandIn(World(vehicle), parameters={"COM_OBL_RC_ACT": 5})
+    client = Client(stand_in)
+    client.sees = True
+    try:
+        client.send(mavlink.MAVLink_set_gps_global_origin_message(1, 473977000, 85456000, 400000))
+        client.fly()
+        client.run(2.6)
+        assert client.mode() is FlightMode.HOLD
+        before = client.world.truth().p_WB
+        client.run(2.0)
+        assert client.world.truth().p_WB == pytest.approx(before, abs=0.05)
+        client.sees = False
+        client.run(6.0)
+        assert client.mode() is FlightMode.LAND
+        assert "Autopilot disengaged, switching to Descend" in client.told()
+    finally:
+        client.socket.close()
+        stand_in.stop()
+
+
+def test_little_thrust_without_motion_is_a_landing(client: Client) -> None:
+    """PX4's land detector in attitude offboard: no descent need be commanded, and no ground be there."""
+    client.fly()
+    assert client.world.autopilot.landed is Landed.IN_AIR
+    x = client.world.plant.x
+    for _ in range(300):
+        x[at.VELOCITY : at.VELOCITY + 3] = 0.0  # something holds the vehicle
+        client.run(0.004, 0.15)
+    assert client.world.autopilot.landed is Landed.IN_AIR  # above MPC_MANTHR_MIN: contact, but no landing
+    for _ in range(280):
+        x[at.VELOCITY : at.VELOCITY + 3] = 0.0
+        client.run(0.004, 0.08)
+    assert client.world.autopilot.landed is Landed.ON_GROUND
+    assert client.texts()[-1] == "Landing detected"
+    client.run(0.02, 0.3)
+    assert client.world.autopilot.landed is Landed.IN_AIR
+
+
+def test_who_does_not_take_off_is_disarmed(vehicle: Vehicle) -> None:
+    stand_in = Px4StandIn(World(vehicle), parameters={"COM_DISARM_PRFLT": 2.0})
+    client = Client(stand_in)
+    try:
+        client.run(0.1, 0.05)
+        assert client.command(SET_MODE, *OFFBOARD) == ACCEPTED
+        assert client.command(ARM, 1.0) == ACCEPTED
+        client.run(1.9, 0.05)
+        assert client.armed()
+        client.run(0.2, 0.05)
+        assert not client.armed()
+        assert client.texts()[-1] == "Disarmed by auto preflight disarming"
+    finally:
+        client.socket.close()
+        stand_in.stop()
+
+
+def test_an_empty_battery_lands(client: Client) -> None:
+    client.sees = True
+    client.fly()
+    charge = client.world.plant.x
+    charge[at.CHARGE] = 0.14
+    client.run(0.1, 0.45)
+    assert "Low battery level, return advised" in client.texts()
+    assert client.mode() is FlightMode.OFFBOARD
+    charge[at.CHARGE] = 0.06
+    client.run(0.1, 0.45)
+    assert "Critical battery level, land now" in client.texts()
+    assert client.mode() is FlightMode.LAND
+    assert client.command(SET_MODE, *OFFBOARD) == ACCEPTED  # who commands it may take it back
+    client.run(0.1, 0.45)
+    assert client.mode() is FlightMode.OFFBOARD
+
+
+def test_an_empty_battery_does_not_arm(client: Client) -> None:
+    client.world.plant.x[at.CHARGE] = 0.05
+    assert client.command(SET_MODE, *OFFBOARD) == ACCEPTED
+    client.run(0.1, 0.3)
+    assert client.command(ARM, 1.0) == REJECTED
+    assert "Preflight Fail: Low battery level" in client.texts()
 
 
 def test_loss_time_is_a_parameter(vehicle: Vehicle) -> None:
@@ -204,9 +304,9 @@ def test_disarming_in_the_air_needs_force(client: Client) -> None:
 
 
 def test_arming_again_after_a_forced_disarm_on_the_ground(client: Client) -> None:
-    assert client.command(ARM, 1.0) == ACCEPTED
+    assert client.command(ARM, 1.0, FORCE) == ACCEPTED
     assert client.command(ARM, 0.0, FORCE) == ACCEPTED
-    assert client.command(ARM, 1.0) == ACCEPTED
+    assert client.command(ARM, 1.0, FORCE) == ACCEPTED
     assert client.command(TERMINATE, 1.0) == ACCEPTED
     assert client.command(ARM, 1.0) == REJECTED
     assert client.command(ARM, 1.0, FORCE) == REJECTED
@@ -214,17 +314,19 @@ def test_arming_again_after_a_forced_disarm_on_the_ground(client: Client) -> Non
 
 
 def test_bad_set_points_are_no_stream(client: Client) -> None:
+    assert client.command(SET_MODE, *OFFBOARD) == ACCEPTED
     client.run(0.6, nan)
-    assert client.command(SET_MODE, *OFFBOARD) == REJECTED
+    assert client.command(ARM, 1.0) == REJECTED
     client.run(0.6, 0.3, LEVEL_RATES | mavlink.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE)
-    assert client.command(SET_MODE, *OFFBOARD) == REJECTED
+    assert client.command(ARM, 1.0) == REJECTED
 
 
 def test_set_points_for_another_system_are_ignored(client: Client) -> None:
     for _ in range(200):
         client.send(mavlink.MAVLink_set_attitude_target_message(0, 7, 1, 128, LEVEL_EAST, 0.0, 0.0, 0.0, 0.3))
         client.run(0.004)
-    assert client.command(SET_MODE, *OFFBOARD) == REJECTED
+    assert client.command(SET_MODE, *OFFBOARD) == ACCEPTED
+    assert client.command(ARM, 1.0) == REJECTED
 
 
 def test_rubbish_is_survived(client: Client) -> None:
@@ -252,8 +354,19 @@ def test_parameters(client: Client) -> None:
 
 
 def test_a_parameter_that_cannot_be_set(vehicle: Vehicle) -> None:
-    with pytest.raises(ValueError, match=r"cannot set COM_OF_LOSS; can set COM_DISARM_LAND, COM_OF_LOSS_T"):
+    with pytest.raises(ValueError, match=r"no parameter COM_OF_LOSS; want perhaps COM_OF_LOSS_T"):
         Px4StandIn(World(vehicle), parameters={"COM_OF_LOSS": 1.0})
+    with pytest.raises(ValueError, match=r"EKF2_EV_CTRL is 7\.5; want a whole number"):
+        Px4StandIn(World(vehicle), parameters={"EKF2_EV_CTRL": 7.5})
+    with pytest.raises(ValueError, match=r"COM_OF_LOSS_T is 99\.0: .*<= 5"):
+        Px4StandIn(World(vehicle), parameters={"COM_OF_LOSS_T": 99.0})
+
+
+def test_it_holds_the_parameters_of_the_vehicle(vehicle: Vehicle) -> None:
+    stand_in = Px4StandIn(World(vehicle))
+    stand_in.stop()
+    wanted = read_parameter_file(FILE)
+    assert {name: pytest.approx(stand_in.parameters[name]) for name in wanted} == wanted
 
 
 def test_timesync_and_ping(client: Client) -> None:
@@ -288,7 +401,7 @@ def test_a_taken_port_is_told(vehicle: Vehicle) -> None:
 
 def test_long_texts_come_in_pieces(client: Client) -> None:
     client.run(0.004)
-    client.stand_in._say(mavlink.MAV_SEVERITY_INFO, "x" * 100)
+    client.stand_in._say(Severity.INFO, "x" * 100)
     pieces = of(client.run(0.004), "STATUSTEXT")
     assert [(len(p.text), p.chunk_seq) for p in pieces] == [(50, 0), (50, 1), (0, 2)]
     assert len({p.id for p in pieces} - {0}) == 1

@@ -1,0 +1,306 @@
+"""What PX4's commander and land detector decide: modes, arming checks, failsafes, landing, battery.
+
+The rules are those of PX4 v1.16 (modules commander and land_detector) for a multicopter without a pilot's sticks and
+without satellites, as far as an offboard flight meets them:
+
+- Disarmed, any mode may be chosen; armed, only one that can run. Hold wants a local and a global position, the latter
+  not to be had from vision alone; Land wants a local position; offboard attitude wants nothing but its signal.
+- What cannot run falls back: Hold, Return (wants home), Land, Descend (level, down at MPC_LAND_SPEED), termination.
+- While disarmed, PX4's land detector says landed. In offboard attitude it takes thrust under MPC_MANTHR_MIN and a
+  hundredth, without motion, for a landing; so any thrust above is a takeoff. In PX4's own modes its position controller
+  takes the thrust away on the ground; here, being on the ground and still stands for that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from math import hypot, radians
+
+from drivers.samples import FlightMode, Landed, Vec3
+from drivers.thrust import motor_signal, thrust_fraction
+from drivers.vehicle import Vehicle
+from sim_backend import layout as at
+from sim_backend.autopilot import Array, Autopilot, AutopilotParams, Descent, speed_of
+from sim_backend.motors import rated_voltage
+from sim_backend.px4_estimator import PositionEstimator
+
+
+class Severity(IntEnum):
+    """MAV_SEVERITY, as far as it is used."""
+
+    EMERGENCY = 0
+    CRITICAL = 2
+    ERROR = 3
+    WARNING = 4
+    INFO = 6
+
+
+class Action(IntEnum):
+    """What PX4 may do about a failure, in the order in which one falls back to the next."""
+
+    HOLD = 0
+    RETURN = 1
+    LAND = 2
+    DESCEND = 3
+    TERMINATE = 4
+    DISARM = 5
+
+
+#: COM_OBL_RC_ACT; Position, Altitude and Stabilized want sticks, without which NAV_RCL_ACT decides.
+_OFFBOARD_LOSS = {3: Action.RETURN, 4: Action.LAND, 5: Action.HOLD, 6: Action.TERMINATE, 7: Action.DISARM}
+_CONTROL_LOSS = {1: Action.HOLD, 2: Action.RETURN, 3: Action.LAND, 5: Action.TERMINATE, 6: Action.DISARM}
+_STAGE = 1.0 / 3.0  # s that each of ground contact, maybe landed and landed lasts before it is believed
+_LOW, _CRITICAL, _EMERGENCY = 1, 2, 3
+_BATTERY = {
+    _LOW: (Severity.WARNING, "Low battery level, return advised"),
+    _CRITICAL: (Severity.CRITICAL, "Critical battery level, land now"),
+    _EMERGENCY: (Severity.EMERGENCY, "Emergency battery level, land immediately"),
+}
+_NAMES = {FlightMode.OFFBOARD: "Offboard", FlightMode.HOLD: "Hold", FlightMode.LAND: "Land"}
+
+
+class _Held:
+    """True once a condition has held for a third of a second; false at once."""
+
+    def __init__(self, state: bool) -> None:
+        self.state = state
+        self._since: float | None = None
+
+    def update(self, t: float, condition: bool) -> bool:
+        if not condition:
+            self._since, self.state = None, False
+        elif not self.state:
+            self._since = t if self._since is None else self._since
+            self.state = t - self._since >= _STAGE - 1e-9
+        return self.state
+
+
+class Commander(Autopilot):
+    """PX4 in the place of the world's plain autopilot.
+
+    ``parameter`` gives PX4's parameters by name, ``say`` takes status texts. ``velocity_error`` (m/s, W) is the
+    estimator's, to be kept up to date by the owner.
+    """
+
+    def __init__(
+        self,
+        params: AutopilotParams,
+        vehicle: Vehicle,
+        parameter: Callable[[str], float],
+        estimator: PositionEstimator,
+        say: Callable[[Severity, str], None],
+    ) -> None:
+        super().__init__(params)
+        self._vehicle = vehicle
+        self._parameter = parameter
+        self._estimator = estimator
+        self._say = say
+        self.velocity_error: Vec3 = (0.0, 0.0, 0.0)
+        #: Somebody has told PX4 where on earth it is.
+        self.global_origin = False
+        self.terminated = False
+        #: A failsafe has taken over.
+        self.failsafe = False
+        self._blind = False
+        self._now = 0.0
+        self._contact, self._maybe, self._down = _Held(True), _Held(True), _Held(True)
+        self._took_off = False
+        self._since_armed = 0.0
+        self._down_since: float | None = None
+        self._charge = 1.0
+        self._warned = 0
+        self._warned_at_arming = 0
+
+    # -- what is asked of it --------------------------------------------------------------------------------------
+
+    def streaming(self, t: float) -> bool:
+        """Set-points come."""
+        return t - self._stream_last <= self.params.offboard_timeout
+
+    def can_run(self, mode: FlightMode, t: float) -> bool:
+        """The mode has what it needs."""
+        return not self._lacking(mode, t)
+
+    def _lacking(self, mode: FlightMode, t: float) -> list[str]:
+        """What the mode needs and does not have, in PX4's words."""
+        if mode is FlightMode.OFFBOARD:
+            return [] if self.streaming(t) else ["No offboard signal"]
+        lacking = []
+        if not self._estimator.horizontal_valid(t):
+            lacking.append("Navigation error: No valid position estimate")
+        if mode is FlightMode.HOLD and not self.global_origin:
+            lacking.append("Navigation error: No valid global position estimate")
+        return lacking
+
+    def failures(self, t: float) -> list[str]:
+        """Why it would not arm in the present mode, in PX4's words."""
+        if self.terminated:
+            return ["Flight termination active"]
+        failures = self._lacking(self.mode, t)
+        if self.mode is FlightMode.LAND:
+            failures = ["Mode not suitable for arming", *failures]
+        if self._charge <= self._parameter("BAT_CRIT_THR"):
+            failures.append("Low battery level")
+        return failures
+
+    def switch(self, mode: FlightMode, t: float) -> bool:
+        """Change the mode, as the pilot's or the computer's command; refused in words."""
+        if self.terminated or mode is FlightMode.OTHER or (self.armed and not self.can_run(mode, t)):
+            name = _NAMES.get(mode, "this mode")
+            self._say(Severity.CRITICAL, f"Switching to {name} is currently not available")
+            return False
+        self.mode = mode
+        self.failsafe = False
+        return True
+
+    def try_arm(self, t: float, force: bool) -> bool:
+        """Arm on command; refused in words. Without checks if forced, but never after a termination."""
+        if self.armed:
+            return True
+        failures = self.failures(t)
+        if failures and (self.terminated or not force):
+            for failure in failures:
+                self._say(Severity.CRITICAL, f"Preflight Fail: {failure}")
+            self._say(Severity.CRITICAL, "Arming denied: Resolve system health failures first")
+            return False
+        self.killed = False
+        self.armed = True
+        self._since_armed = t
+        self._took_off = False
+        self._warned_at_arming = self._warned
+        self._say(Severity.INFO, "Armed by external command")
+        return True
+
+    def try_disarm(self, force: bool) -> bool:
+        """Disarm on command; refused in the air, in words, unless forced."""
+        if not self.armed:
+            return True
+        if not force and not (self._down.state or self._maybe.state):
+            self._say(Severity.CRITICAL, "Disarming denied: not landed")
+            return False
+        self._disarm("external command")
+        return True
+
+    def terminate(self) -> None:
+        """Motors off until the next boot."""
+        if not self.terminated:
+            self.terminated = self.failsafe = True
+            self._stop()
+            self._say(Severity.EMERGENCY, "Flight termination active")
+
+    def _disarm(self, reason: str) -> None:
+        self._stop()
+        self.failsafe = False
+        self._say(Severity.INFO, f"Disarmed by {reason}")
+
+    # -- what it does by itself -----------------------------------------------------------------------------------
+
+    def _fail_safe(self, t: float) -> None:
+        if not self.armed:
+            return
+        self._watch_battery()
+        if self.mode is FlightMode.OFFBOARD and not self.streaming(t):
+            action = _OFFBOARD_LOSS.get(int(self._parameter("COM_OBL_RC_ACT")))
+            if action is None:
+                action = _CONTROL_LOSS.get(int(self._parameter("NAV_RCL_ACT")), Action.RETURN)
+            self._take(action, t, "No offboard signal")
+        elif self.mode is FlightMode.HOLD and self._down.state is False and not self.can_run(FlightMode.HOLD, t):
+            self._take(Action.RETURN, t, "No valid position estimate")
+        elif self.mode is FlightMode.LAND:
+            blind = not self.can_run(FlightMode.LAND, t)
+            if blind and not self._blind:
+                self._take(Action.DESCEND, t, "No valid position estimate")
+            self._blind = blind
+
+    def _take(self, action: Action, t: float, cause: str) -> None:
+        """Enter a failsafe: the wanted action, or what it falls back to."""
+        if action is Action.HOLD and not self.can_run(FlightMode.HOLD, t):
+            action = Action.RETURN
+        if action is Action.RETURN:  # wants a home position, which is a global one
+            action = Action.LAND
+        if action is Action.LAND and not self.can_run(FlightMode.LAND, t):
+            action = Action.DESCEND
+        self.failsafe = True
+        if action is Action.DISARM:
+            self._disarm("failsafe")
+            return
+        if action is Action.TERMINATE:
+            self.terminate()
+            return
+        self.mode = FlightMode.HOLD if action is Action.HOLD else FlightMode.LAND
+        self._blind = action is Action.DESCEND
+        what = "Autopilot disengaged, switching" if self._blind else "switching"
+        self._say(Severity.CRITICAL, f"Failsafe activated: {what} to {action.name.title()} ({cause})")
+
+    def _watch_battery(self) -> None:
+        """Tell each worse level once, and act on it as COM_LOW_BAT_ACT says."""
+        thresholds = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
+        level = sum(self._charge <= self._parameter(name) for name in thresholds)
+        if level <= self._warned:
+            return
+        self._warned = level
+        self._say(*_BATTERY[level])
+        acts_at = {2: _CRITICAL, 3: _CRITICAL}.get(int(self._parameter("COM_LOW_BAT_ACT")))
+        if acts_at is not None and level >= acts_at and level > self._warned_at_arming:
+            self._take(Action.LAND, self._now, "Battery level")
+
+    def _disarm_landed(self, t: float) -> None:
+        if not self.armed:
+            return
+        landed_for, before_takeoff = self.params.disarm_delay, self._parameter("COM_DISARM_PRFLT")
+        if self._took_off:
+            if landed_for > 0.0 and self._down_since is not None and t - self._down_since >= landed_for:
+                self._disarm("landing")
+        elif before_takeoff > 0.0 and t - self._since_armed >= before_takeoff:
+            self._disarm("auto preflight disarming")
+
+    def _own_flight(self, t: float) -> Descent:
+        speed = self.params.descent_speed if self.mode is FlightMode.LAND else 0.0
+        return Descent(speed, self.mode is FlightMode.LAND and self._blind, self.velocity_error)
+
+    # -- land detector --------------------------------------------------------------------------------------------
+
+    def _detect_land(self, t: float, x: Sequence[float], u: Array) -> None:
+        self._now, self._charge = t, x[at.CHARGE]
+        contact, minimum = self._ground_contact(x, u)
+        contact = self._contact.update(t, not self.armed or contact)
+        turning = hypot(x[at.RATE], x[at.RATE + 1]) > self._widened(radians(self._parameter("LNDMC_ROT_MAX")))
+        maybe = self._maybe.update(t, not self.armed or (minimum and contact and not turning))
+        before = self._down.state
+        down = self._down.update(t, not self.armed or maybe)
+        if down and not before:
+            self._down_since = t
+            self._say(Severity.INFO, "Landing detected")
+        elif before and not down:
+            self._down_since, self._took_off = None, True
+            self._say(Severity.INFO, "Takeoff detected")
+        self.landed = Landed.ON_GROUND if down else Landed.IN_AIR
+
+    def _ground_contact(self, x: Sequence[float], u: Array) -> tuple[bool, bool]:
+        """Whether the ground is touched, and whether the thrust is as little as on the ground."""
+        if self.mode is not FlightMode.OFFBOARD:
+            # Own modes: contact counts once going down, and after it the position controller takes the thrust away.
+            going_down = self.mode is FlightMode.LAND or self._maybe.state
+            resting = x[at.ON_GROUND] != 0.0 and speed_of(x) < self._parameter("LNDMC_Z_VEL_MAX") and going_down
+            return resting, resting
+        v_z = x[at.VELOCITY + 2] + self.velocity_error[2]
+        rising_or_falling = abs(v_z) >= self._widened(self._parameter("LNDMC_Z_VEL_MAX"))
+        drift = hypot(x[at.VELOCITY] + self.velocity_error[0], x[at.VELOCITY + 1] + self.velocity_error[1])
+        moving = rising_or_falling or drift > self._parameter("LNDMC_XY_VEL_MAX")
+        least, hover = self._parameter("MPC_THR_MIN"), self._parameter("MPC_THR_HOVER")
+        thrust = self._set_point(x, u)
+        return thrust <= least + 0.6 * (hover - least) and not moving, thrust <= self._parameter(
+            "MPC_MANTHR_MIN"
+        ) + 0.01
+
+    def _widened(self, threshold: float) -> float:
+        """Once landed, more motion is needed to be in the air again."""
+        return 2.5 * threshold if self._down.state else threshold
+
+    def _set_point(self, x: Sequence[float], u: Array) -> float:
+        """PX4's thrust set-point 0..1 behind the present demand of the rotors."""
+        rotors = self._vehicle.rotors
+        full = 4.0 * rotors.max_thrust * (x[at.VOLTAGE] / rated_voltage(self._vehicle.battery)) ** 2
+        fraction = min(max(float(sum(u[at.U_ROTOR : at.U_ROTOR + 4])) / full, 0.0), 1.0)
+        return thrust_fraction(motor_signal(fraction, rotors.curve), self._parameter("THR_MDL_FAC"))
