@@ -16,16 +16,18 @@ from typing import Any, TypeVar
 
 import serial
 from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
-from dynamixel_sdk.robotis_def import BROADCAST_ID, COMM_RX_TIMEOUT, COMM_SUCCESS
+from dynamixel_sdk.robotis_def import COMM_RX_TIMEOUT, COMM_SUCCESS
 from msgspec import Struct
 
 from drivers.protocols import DeviceError
-from drivers.xc330 import Item
+from drivers.xc330 import SIZE, Item
 
 T = TypeVar("T")
 
 _BITS_PER_BYTE = 10
-_QUIET = 0.25  # of the reply margin: how long nothing may come until the line is taken for quiet
+_MARKS = 3  # different lengths of reads, by which answers are told apart
+_PARAMETERS = 8  # where they begin in a packet
+_BROADCAST = 254
 _ALERT = 0x80
 _ERROR_NUMBERS = {
     1: "the instruction failed",
@@ -79,6 +81,8 @@ class Port:
         self.margin = reply_margin
         self._deadline = 0.0
         self._sent = 0
+        self.unasked = 0
+        """How often something lay there before a question was sent."""
         self._serial = _open(path, baud)
         self._latency = latency_timer(path)
         self._fd = self._serial.fileno()
@@ -87,12 +91,6 @@ class Port:
         """Let the port go; safe to call twice, and when the adapter is gone."""
         self._serial.close()
 
-    def quieten(self) -> None:
-        """Forget what is still on its way: wait until nothing has come for a moment."""
-        while select.select([self._fd], [], [], _QUIET * self.margin)[0]:
-            if not os.read(self._fd, 4096):
-                raise OSError("the serial adapter is gone")
-
     # What dynamixel-sdk calls, by its names.
 
     def getBaudRate(self) -> int:
@@ -100,8 +98,9 @@ class Port:
         return self._baud
 
     def clearPort(self) -> None:
-        """Forget what came late."""
+        """Forget what came late; ``unasked`` counts it."""
         try:
+            self.unasked += bool(self._serial.in_waiting)
             self._serial.reset_input_buffer()
         except termios.error as error:
             raise OSError(*error.args) from error
@@ -186,13 +185,22 @@ class Bus:
 
     Every call raises NoAnswer, Corrupt or Refused when it came to nothing, and OSError when the adapter is gone. The
     alert bit of an answer is no failure; it is told in ``Answer.alert``.
+
+    Answers carry no number. So that one that comes after its time is not taken for the next, each read asks for none,
+    one or two bytes more than it wants, in turn: the length tells which question an answer belongs to.
     """
 
     def __init__(self, port: Port) -> None:
         self._port = port
         self._packets: Any = Protocol2PacketHandler()
         self._attempts = 1
-        self._doubtful = False
+        self._mark = 0
+        self._late = 0
+
+    @property
+    def late(self) -> int:
+        """Answers that came after their time."""
+        return self._late + self._port.unasked
 
     def patient(self, attempts: int, reply_margin: float) -> None:
         """How often a read or write of one servo is tried, and how late an answer may be, s."""
@@ -208,9 +216,9 @@ class Bus:
         return self._tried(lambda: self._read_once(servo, address, length))
 
     def _read_once(self, servo: int, address: int, length: int) -> Answer:
-        self._settle()
-        data, result, error = self._packets.readTxRx(self._port, servo, address, length)
-        return self._answer(servo, length, data, result, error)
+        asked = self._marked(address, length)
+        self._judge(servo, self._packets.readTx(self._port, servo, address, asked))
+        return self._answer(servo, asked, length)
 
     def read(self, servo: int, item: Item) -> int:
         """The value of one item."""
@@ -221,7 +229,6 @@ class Bus:
         self._tried(lambda: self._write_once(servo, address, data))
 
     def _write_once(self, servo: int, address: int, data: bytes) -> None:
-        self._settle()
         result, error = self._packets.writeTxRx(self._port, servo, address, len(data), list(data))
         self._judge(servo, result, error)
 
@@ -231,7 +238,6 @@ class Bus:
 
     def reboot(self, servo: int) -> None:
         """Restart the servo; it is silent for a moment afterwards."""
-        self._settle()
         result, error = self._packets.reboot(self._port, servo)
         self._judge(servo, result, error)
 
@@ -242,24 +248,20 @@ class Bus:
 
     def sync_write(self, address: int, length: int, data: Mapping[int, bytes]) -> None:
         """Write ``length`` bytes to each servo of ``data``. Servos do not answer this."""
-        self._settle()
         parameters: list[int] = []
         for servo, content in data.items():
             parameters.append(servo)
             parameters.extend(content)
         result = self._packets.syncWriteTxOnly(self._port, address, length, parameters, len(parameters))
-        self._judge(None, result, 0)
+        self._judge(None, result)
 
     def sync_read(self, address: int, length: int, servos: Sequence[int], fast: bool) -> list[Answer]:
         """``length`` bytes of each servo, in the order of ``servos``; ``fast``: all in one packet."""
-        self._settle()
-        result = self._packets.syncReadTx(self._port, address, length, list(servos), len(servos), fast)
-        if result != COMM_SUCCESS:
-            self._port.is_using = False
-            self._judge(None, result, 0)
+        asked = self._marked(address, length)
+        self._judge(None, self._packets.syncReadTx(self._port, address, asked, list(servos), len(servos), fast))
         if fast:
-            return self._fast_answers(length, servos)
-        return [self._answer(servo, length, *self._packets.readRx(self._port, servo, length)) for servo in servos]
+            return self._fast_answers(asked, length, servos)
+        return [self._answer(servo, asked, length) for servo in servos]
 
     def _tried(self, what: Callable[[], T]) -> T:
         for _ in range(self._attempts - 1):
@@ -269,37 +271,43 @@ class Bus:
                 continue
         return what()
 
-    def _answer(self, servo: int, length: int, data: Sequence[int], result: int, error: int) -> Answer:
-        self._judge(servo, result, error)
-        if len(data) != length:
-            raise Corrupt(servo, f"asked for {length} bytes, got {len(data)}")
-        return Answer(bytes(data), bool(error & _ALERT))
+    def _marked(self, address: int, length: int) -> int:
+        """How many bytes to ask for."""
+        self._mark = (self._mark + 1) % _MARKS
+        return min(length + self._mark, SIZE - address)
 
-    def _fast_answers(self, length: int, servos: Sequence[int]) -> list[Answer]:
+    def _receive(self, who: int, length: int) -> bytes:
+        """Error, parameters: of the answer of ``who`` with so many parameters, or with an error; others are late."""
+        while True:
+            packet, result = self._packets.rxPacket(self._port, True)
+            self._judge(None if who == _BROADCAST else who, result)
+            if packet[4] != _BROADCAST:
+                packet = self._packets.removeStuffing(packet)
+            # Behind the length come the instruction, the error, the parameters and the CRC.
+            content = bytes(packet[_PARAMETERS : _PARAMETERS - 3 + (packet[5] | packet[6] << 8)])
+            if packet[4] == who and (len(content) == 1 + length or (who != _BROADCAST and content[0] & ~_ALERT)):
+                return content
+            self._late += 1
+
+    def _answer(self, servo: int, asked: int, length: int) -> Answer:
+        content = self._receive(servo, asked)
+        self._judge(servo, COMM_SUCCESS, content[0])
+        return Answer(content[1 : 1 + length], bool(content[0] & _ALERT))
+
+    def _fast_answers(self, asked: int, length: int, servos: Sequence[int]) -> list[Answer]:
         # Each servo adds error, id, data and the CRC so far; the last CRC covers the packet.
-        each = length + 4
-        data, result, _ = self._packets.fastSyncReadRx(self._port, BROADCAST_ID, each * len(servos))
-        self._judge(None, result, 0)
-        if len(data) != each * len(servos):
-            raise Corrupt(None, f"a fast sync read of {len(servos)} servos gave {len(data)} bytes")
+        each = asked + 4
+        content = self._receive(_BROADCAST, each * len(servos) - 3) + b"\0\0"
         answers = []
-        for start, servo in zip(range(0, len(data), each), servos, strict=True):
-            error, who = data[start], data[start + 1]
+        for start, servo in zip(range(0, len(content), each), servos, strict=True):
+            error, who = content[start], content[start + 1]
             if who != servo:
-                self._doubtful = True
                 raise Corrupt(servo, f"servo {who} answered in the place of {servo}")
             self._judge(servo, COMM_SUCCESS, error)
-            answers.append(Answer(bytes(data[start + 2 : start + 2 + length]), bool(error & _ALERT)))
+            answers.append(Answer(content[start + 2 : start + 2 + length], bool(error & _ALERT)))
         return answers
 
-    def _settle(self) -> None:
-        """After a failure, let a late answer pass: nothing in it tells which question it belongs to."""
-        if self._doubtful:
-            self._doubtful = False
-            self._port.quieten()
-
-    def _judge(self, servo: int | None, result: int, error: int) -> None:
-        self._doubtful = result != COMM_SUCCESS
+    def _judge(self, servo: int | None, result: int, error: int = 0) -> None:
         if result == COMM_RX_TIMEOUT:
             raise NoAnswer(servo, "no answer")
         if result != COMM_SUCCESS:

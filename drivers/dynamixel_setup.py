@@ -114,6 +114,8 @@ class SetUp:
         self._settings = settings
         self._servos = servos
         self._tell = tell
+        self.fast = True
+        """The servos answer fast sync reads."""
 
     def find(self, bus: Bus) -> None:
         """Make sure that every servo is there and is what it should be."""
@@ -232,38 +234,49 @@ class SetUp:
         bus.write_bytes(name, xc330.INDIRECT_ADDRESS, MAP)
         if bus.read_bytes(name, xc330.INDIRECT_ADDRESS, len(MAP)).data != MAP:
             raise Refused(name, "it did not take the indirect addresses")
-        self.shape(bus, servo)
+        self.shape(bus, [servo])
+        self._confirm_shape(bus, servo)
         servo.place(bus.read(name, xc330.PRESENT_POSITION), near)
         volts, degrees = HEALTH.unpack(bus.read_bytes(name, xc330.PRESENT_VOLTAGE.address, HEALTH.size).data)
         servo.voltage, servo.temperature = volts * xc330.VOLT_PER_UNIT, float(degrees)
         servo.engaged = False
 
-    def shape(self, bus: Bus, servo: Servo) -> None:
-        """Profile and gains, which a change of the operating mode forgets as well."""
-        mine = servo.settings
-        profile = (
-            round(mine.profile_acceleration / xc330.RAD_S2_PER_UNIT),
-            round(mine.profile_velocity / xc330.RAD_S_PER_UNIT),
-        )
-        if any(profile):
-            self._confirm(bus, servo, xc330.PROFILE_ACCELERATION.address, struct.pack("<II", *profile))
-        if mine.gains is not None:
-            p, i, d = mine.gains
-            self._confirm(bus, servo, xc330.POSITION_D.address, struct.pack("<HHH", d, i, p))
+    def shape(self, bus: Bus, servos: Sequence[Servo]) -> None:
+        """Write profile and gains, which a change of the operating mode forgets as well; none are read back."""
+        shapes = {servo.settings.id: _shape(servo.settings) for servo in servos}
+        for address in sorted({address for shape in shapes.values() for address in shape}):
+            data = {name: shape[address] for name, shape in shapes.items() if address in shape}
+            bus.sync_write(address, len(next(iter(data.values()))), data)
 
-    def _confirm(self, bus: Bus, servo: Servo, address: int, data: bytes) -> None:
-        bus.write_bytes(servo.settings.id, address, data)
-        if bus.read_bytes(servo.settings.id, address, len(data)).data != data:
-            raise Refused(servo.settings.id, f"it did not take what was written to address {address}")
+    def _confirm_shape(self, bus: Bus, servo: Servo) -> None:
+        for address, data in _shape(servo.settings).items():
+            if bus.read_bytes(servo.settings.id, address, len(data)).data != data:
+                raise Refused(servo.settings.id, f"it did not take what was written to address {address}")
 
-    def probe(self, bus: Bus) -> bool:
-        """Whether the servos answer a fast sync read; told if not."""
+    def probe(self, bus: Bus) -> None:
+        """Find out whether the servos answer a fast sync read; told if not."""
         ids = [servo.settings.id for servo in self._servos]
         for _ in range(3):
             try:
                 bus.sync_read(READ_AT, READ.size, ids, fast=True)
-                return True
+                self.fast = True
+                return
             except BusError:
                 continue
+        self.fast = False
         self._tell(Level.WARNING, "the servos do not answer fast sync reads; plain sync reads are used")
-        return False
+
+
+def _shape(settings: ServoSettings) -> dict[int, bytes]:
+    """Profile and gains as they lie in the control table, by address."""
+    shape = {}
+    profile = (
+        round(settings.profile_acceleration / xc330.RAD_S2_PER_UNIT),
+        round(settings.profile_velocity / xc330.RAD_S_PER_UNIT),
+    )
+    if any(profile):
+        shape[xc330.PROFILE_ACCELERATION.address] = struct.pack("<II", *profile)
+    if settings.gains is not None:
+        p, i, d = settings.gains
+        shape[xc330.POSITION_D.address] = struct.pack("<HHH", d, i, p)
+    return shape

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from enum import StrEnum
 from threading import Lock
 from typing import Generic, TypeVar
@@ -13,6 +14,7 @@ T = TypeVar("T")
 
 _WINDOW_NS = 1_000_000_000
 _KEPT_NOTICES = 256
+_TELL_AGAIN_NS = 10_000_000_000
 
 
 class MailboxCounts(Struct, frozen=True, gc=False):
@@ -109,3 +111,26 @@ class Notices:
         while self._notices:
             taken.append(self._notices.popleft())
         return tuple(taken)
+
+
+class Teller:
+    """Tells sentences with the time of a clock; what happens again and again, once in ten seconds."""
+
+    def __init__(self, notices: Notices, clock: Callable[[], int]) -> None:
+        self._notices = notices
+        self._clock = clock
+        self._told: dict[str, tuple[int, int]] = {}
+
+    def tell(self, level: Level, text: str) -> None:
+        """Tell it."""
+        self._notices.tell(self._clock(), level, text)
+
+    def once(self, key: str, level: Level, text: str) -> None:
+        """Tell it, unless the same was told within the last ten seconds; then count it for the next time."""
+        now = self._clock()
+        since, more = self._told.get(key, (now - _TELL_AGAIN_NS, 0))
+        if now - since < _TELL_AGAIN_NS:
+            self._told[key] = (since, more + 1)
+            return
+        self._told[key] = (now, 0)
+        self.tell(level, f"{text} (and {more} times since it was last told)" if more else text)

@@ -641,7 +641,7 @@ class Steps:
         self.driver = Dynamixel(DynamixelSettings("", health=5.0), clock=lambda: self.now)
         for servo in self.driver._servos:
             servo.heard_ns = self.now
-        self.driver._health_ns = self.now + 10**10
+        self.driver._watch._health_ns = self.now + 10**10
         self.cycle()
 
     def cycle(self) -> bool:
