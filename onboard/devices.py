@@ -18,7 +18,7 @@ from drivers.samples import Interface
 from drivers.spread import Summary
 from drivers.t265 import T265
 from drivers.thrust import ThrustMap
-from onboard.config import Config
+from onboard.config import CONFIGS, Config
 from onboard.device_config import Kind
 from onboard.layers import ConfigError
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
@@ -111,7 +111,10 @@ class FlightDevices(DeviceSet):
         if settings.kind is Kind.MOCK:
             assert self.world is not None
             return LinkedAutopilot(self.world)
-        self._px4 = Px4(settings, thrust=ThrustMap.of(config.vehicle))
+        parameters = settings.parameters
+        if parameters and "/" not in parameters:
+            parameters = str(CONFIGS / "px4" / parameters)
+        self._px4 = Px4(replace(settings, parameters=parameters), thrust=ThrustMap.of(config.vehicle))
         return self._px4
 
     def _odometry_of(self, config: Config) -> OdometryDevice:
@@ -176,7 +179,7 @@ class FlightDevices(DeviceSet):
 
     def obstacles(self) -> tuple[str, ...]:
         """Why the vehicle must not arm."""
-        return self._mixed
+        return self._mixed if self._px4 is None else (*self._mixed, *self._px4.parameter_differences())
 
     def notices(self) -> tuple[Notice, ...]:
         """What the drivers have had to tell since the last call."""
