@@ -100,7 +100,7 @@ def start(arguments: Sequence[str], stdout: int | None = None, stderr: int | Non
     """Start an onboard process in a process group of its own, attended through its standard input."""
     command = [sys.executable, "-P", "-m", "onboard", *arguments]
     child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, text=True, process_group=0)
-    # Where the machine grants it (to root, or with RLIMIT_RTPRIO), so that what else runs there is not what is measured.
+    # Where the machine grants it (root, RLIMIT_RTPRIO), so that what else runs there is not what is measured.
     with suppress(OSError):
         os.sched_setscheduler(child.pid, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     return child

@@ -149,7 +149,7 @@ class FlightDevices(DeviceSet):
         try:
             while pending:
                 _, pending = await asyncio.wait(pending, timeout=_TELL_PERIOD)
-                for notice in self.notices():
+                for _, notice in self.notices():
                     say(notice.text)
         finally:
             for task in pending:
@@ -181,10 +181,10 @@ class FlightDevices(DeviceSet):
         """Why the vehicle must not arm."""
         return self._mixed if self._px4 is None else (*self._mixed, *self._px4.parameter_differences())
 
-    def notices(self) -> tuple[Notice, ...]:
-        """What the drivers have had to tell since the last call."""
-        told = [notice for device in self._named.values() for notice in device.notices()]
-        return tuple(sorted(told, key=lambda notice: notice.t_ns))
+    def notices(self) -> list[tuple[str, Notice]]:
+        """What the drivers have had to tell since the last call, each with the name of its device."""
+        told = [(name, notice) for name, device in self._named.items() for notice in device.notices()]
+        return sorted(told, key=lambda item: item[1].t_ns)
 
     def statistics(self) -> dict[str, float]:
         """Rates, counts and times of drivers and link since the start, by dotted name; SI."""

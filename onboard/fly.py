@@ -72,7 +72,7 @@ async def fly(
             finally:
                 notifier.stopping()
                 await devices.stop()
-                for notice in devices.notices():
+                for _, notice in devices.notices():
                     say(notice.text)
     return flight.began
 
@@ -176,8 +176,8 @@ class _Flight:
         for event in outputs.events:  # the recorder has these from the tick
             if event.severity is not Severity.INFO:
                 self._say(event.text)
-        for notice in self._devices.notices():
-            self._tell(Event(notice.t_ns, notice.text.partition(":")[0], _SEVERITY[notice.level], notice.text))
+        for device, notice in self._devices.notices():
+            self._tell(Event(notice.t_ns, device, _SEVERITY[notice.level], notice.text))
         assert self._reloader is not None
         if changes := self._reloader.events(now):
             self._notifier.ready()

@@ -16,6 +16,7 @@ from types import TracebackType
 from groundstation.desk import Desk, end, start
 from sim_backend.world_client import WorldClient
 from sim_backend.world_messages import Look
+from tests.realtime import alone
 
 #: Whatever is waited for comes well before this, s: the machine may be busy.
 PATIENCE = 60.0
@@ -168,7 +169,7 @@ class Flying:
 
 
 @contextmanager
-def flying(folder: Path, *sets: str) -> Iterator[Flying]:
-    """A flight in a folder of its own."""
-    with Flying(folder, *sets) as flight:
+def flying(folder: Path, *sets: str, config: str = "desk") -> Iterator[Flying]:
+    """A flight with a folder for its log, the only one of this machine."""
+    with alone(), Flying(folder, *sets, config=config) as flight:
         yield flight
