@@ -48,7 +48,7 @@ class DynamixelSettings(Struct, frozen=True, forbid_unknown_fields=True):
     period: Annotated[float, _meta("s", "between cycles while nothing is commanded", 0.001, 0.1)] = 0.004
     patience: Annotated[float, _meta("s", "without a command the bus is left silent after this", 0.005, 1.0)] = 0.030
     watchdog: Annotated[float, _meta("s", "silence that makes the servos stop; steps of 0.02", 0.02, 2.54)] = 0.10
-    reply_margin: Annotated[float, _meta("s", "answers may be late by this", 0.0005, 0.05)] = 0.004
+    reply_margin: Annotated[float, _meta("s", "answers may be late by this", 0.0005, 0.05)] = 0.010
     silent_after: Annotated[float, _meta("s", "without an answer until a servo counts as silent", 0.01, 1.0)] = 0.05
     retry: Annotated[float, _meta("s", "between attempts to find a lost servo or adapter", 0.05, 10.0)] = 0.25
     health: Annotated[float, _meta("s", "between looks at one servo's voltage and temperature", 0.01, 5.0)] = 0.05
