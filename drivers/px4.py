@@ -65,6 +65,7 @@ class Px4Settings(Struct, frozen=True, forbid_unknown_fields=True):
     thrust: ThrustMap | None = None
     """The identified map; without one the constructor of ``Px4`` is given the one that the vehicle implies."""
     parameters: Annotated[str, _text("file with the parameters that PX4 must hold (configs/px4); empty: none")] = ""
+    may_differ: tuple[Annotated[str, _text("parameter of that file that PX4 need not hold")], ...] = ()
     timeout: Annotated[float, _meta("s", "for each stage of connecting", 0.1, 300.0)] = 10.0
     rate: Annotated[float, _meta("Hz", "asked for attitude and IMU", 10.0, 1000.0)] = 250.0
     stream_time: Annotated[float, _meta("s", "set-points run this long before offboard is asked for", 0.2, 10.0)] = 1.0
@@ -324,9 +325,11 @@ class Px4:
             raise DeviceError(f"autopilot: no URL of PX4 in the settings; {_WANTED_URL}")
         if self._settings.parameters:
             try:
-                self._wanted_parameters = read_parameter_file(Path(self._settings.parameters))
+                wanted = read_parameter_file(Path(self._settings.parameters))
             except ValueError as error:
                 raise DeviceError(f"autopilot: {error}") from error
+            may_differ = self._settings.may_differ
+            self._wanted_parameters = {name: value for name, value in wanted.items() if name not in may_differ}
         loop = asyncio.get_running_loop()
         _hush()
         # The onboard computer shares the vehicle's system id, as PX4 expects of a companion.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from math import isfinite, radians
+from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
@@ -13,7 +14,7 @@ from msgspec.structs import replace
 from drivers.dynamixel import Dynamixel
 from drivers.mailbox import Notice
 from drivers.protocols import AutopilotDevice, Device, DeviceError, OdometryDevice, ServoDevice
-from drivers.px4 import Px4
+from drivers.px4 import Px4, Px4Settings
 from drivers.samples import Interface
 from drivers.spread import Summary
 from drivers.t265 import T265
@@ -58,6 +59,12 @@ def world_of(config: Config) -> World:
 def mock_devices(world: World) -> DeviceSet:
     """All devices in process, on the world's own time."""
     return DeviceSet(MockAutopilot(world), MockOdometry(world), MockServos(world))
+
+
+def parameter_file(settings: Px4Settings) -> Path:
+    """The file with the parameters that PX4 must hold: a name in ``configs/px4``, or a path."""
+    name = settings.parameters
+    return Path(name) if "/" in name else CONFIGS / "px4" / name
 
 
 def check_devices(config: Config) -> None:
@@ -111,9 +118,7 @@ class FlightDevices(DeviceSet):
         if settings.kind is Kind.MOCK:
             assert self.world is not None
             return LinkedAutopilot(self.world)
-        parameters = settings.parameters
-        if parameters and "/" not in parameters:
-            parameters = str(CONFIGS / "px4" / parameters)
+        parameters = str(parameter_file(settings)) if settings.parameters else ""
         self._px4 = Px4(replace(settings, parameters=parameters), thrust=ThrustMap.of(config.vehicle))
         return self._px4
 
@@ -179,7 +184,10 @@ class FlightDevices(DeviceSet):
 
     def obstacles(self) -> tuple[str, ...]:
         """Why the vehicle must not arm."""
-        return self._mixed if self._px4 is None else (*self._mixed, *self._px4.parameter_differences())
+        differences = () if self._px4 is None else self._px4.parameter_differences()
+        if not differences:
+            return self._mixed
+        return (*self._mixed, f"PX4's parameters are not those of the vehicle: {'; '.join(differences)}.")
 
     def notices(self) -> list[tuple[str, Notice]]:
         """What the drivers have had to tell since the last call, each with the name of its device."""
@@ -240,4 +248,4 @@ def _mixed(kinds: dict[str, Kind], hitl: bool) -> tuple[str, ...]:
     unreal = [f"{name} is {kind}" for name, kind in kinds.items() if kind is not Kind.REAL]
     if hitl or not unreal or kinds["autopilot"] is not Kind.REAL:
         return ()
-    return (f"the autopilot is real, but {' and '.join(unreal)}: only with devices.hitl, propellers off",)
+    return (f"The autopilot is real, but {' and '.join(unreal)}: only with devices.hitl, propellers off.",)

@@ -7,6 +7,7 @@ input is a fault in YAML that begins now: ``{device: odometry, kind: nan, durati
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Mapping
@@ -17,16 +18,18 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
+from drivers.px4_parameters import read_parameter_file
 from onboard import attended
 from onboard.config import Config
 from onboard.device_config import Kind
-from onboard.devices import world_of
+from onboard.devices import parameter_file, world_of
 from onboard.layers import ConfigError
 from sim_backend.dynamixel_emulator import emulate
 from sim_backend.faults import Fault, Faults, read_faults
 from sim_backend.pace import Crier, Face, Pace
 from sim_backend.px4_emulator import Px4StandIn
 from sim_backend.px4_simulator_link import Px4SimulatorLink
+from sim_backend.px4_sitl import VARIABLE, Px4Sitl
 from sim_backend.tracker import Tracker
 from sim_backend.world_link import WorldServer
 
@@ -37,6 +40,7 @@ SWITCH_INTERVAL = 0.0005
 class WorldProcess:
     """A world, its faces, and the emulators beside it. Close it to give ports and terminals back.
 
+    Where a real PX4 in software is the autopilot and PIPEWRIGHT_PX4 names its build folder, PX4 is started too.
     ``say`` hears what a person should know. ``servo_link`` is a symbolic link to make to the servo bus's terminal.
     Raises ConfigError for faults that no emulator can show, DeviceError for a port that cannot be had.
     """
@@ -63,6 +67,11 @@ class WorldProcess:
                 link = Px4SimulatorLink(world, devices.simulator, seed=config.seed)
                 self._cleanup.callback(link.close)
                 faces += [link, Crier(link.notices, say)]
+                if VARIABLE in os.environ and devices.simulator.startswith("tcp:"):
+                    parameters = read_parameter_file(parameter_file(devices.autopilot))
+                    px4 = Px4Sitl(Path(os.environ[VARIABLE]), parameters)
+                    self._cleanup.callback(px4.stop)
+                    px4.start()
                 received = lambda: link.received  # noqa: E731
             if kinds["servos"] is Kind.EMULATED:
                 bus = devices.servos
