@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
 
 import pytest
@@ -220,11 +219,11 @@ def test_signals_reach_the_ending_and_the_reload() -> None:
         with signals(run.ending, lambda: reloads.append(1)):
             assert run.tick(Phase.HOLD)
             for number in (signal.SIGHUP, signal.SIGTERM):
-                os.kill(os.getpid(), number)
+                signal.raise_signal(number)
             while not (reloads and run.requests):
                 await asyncio.sleep(0.001)
                 assert run.tick(Phase.HOLD)
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
             goes_on = True
             while goes_on:
                 await asyncio.sleep(0.001)
@@ -243,10 +242,10 @@ def test_before_the_first_tick_connecting_is_broken_off_and_the_devices_released
     async def flight() -> str:
         with signals(run.ending, lambda: None):
             try:
-                os.kill(os.getpid(), signal.SIGTERM)
+                signal.raise_signal(signal.SIGTERM)
                 await asyncio.sleep(3600.0)
             finally:
-                os.kill(os.getpid(), signal.SIGTERM)  # an impatient second one does not break off the release
+                signal.raise_signal(signal.SIGTERM)  # an impatient second one does not break off the release
                 await asyncio.sleep(0.01)
                 released.append("devices")
         return "ended in order"
@@ -263,7 +262,7 @@ def test_after_the_last_tick_the_release_is_not_broken_off() -> None:
             run.tick(Phase.STOPPED)
             run.ending.ask("SIGTERM")
             assert not run.tick(Phase.STOPPED)
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
             await asyncio.sleep(0.01)
             return "released"
 
