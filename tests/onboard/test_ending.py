@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import signal
+from collections.abc import Callable
+from threading import Thread
 
 import pytest
 from msgspec.structs import replace
@@ -252,6 +254,20 @@ def test_before_the_first_tick_connecting_is_broken_off_and_the_devices_released
 
     assert asyncio.run(flight()) == "ended in order"
     assert released == ["devices"]
+
+
+def test_another_thread_asks_for_the_end_in_the_same_way() -> None:
+    run, ends = Run(), list[Callable[[str], None]]()
+
+    async def flight() -> str:
+        with signals(run.ending, lambda: None) as end:
+            ends.append(end)
+            Thread(target=end, args=("standard input has closed",)).start()
+            await asyncio.sleep(3600.0)
+        return "ended in order"
+
+    assert asyncio.run(flight()) == "ended in order"
+    ends[0]("too late to matter")
 
 
 def test_after_the_last_tick_the_release_is_not_broken_off() -> None:
