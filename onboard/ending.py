@@ -120,27 +120,32 @@ async def hand_over(autopilot: AutopilotDevice, command: AutopilotCommand, clock
 
 
 @contextmanager
-def signals(ending: Ending, reload: Callable[[], None]) -> Iterator[None]:
+def signals(ending: Ending, reload: Callable[[], None]) -> Iterator[Callable[[str], None]]:
     """SIGINT and SIGTERM ask for the end, SIGHUP for a reload, within the running event loop.
 
-    While nothing ticks yet, being asked for the end breaks off what is inside (and nothing is raised).
+    While nothing ticks yet, being asked for the end breaks off what is inside (and nothing is raised). Gives a function
+    that asks for the end in the same way, with the reason as its argument, from any thread.
     """
     loop, task = asyncio.get_running_loop(), asyncio.current_task()
     assert task is not None
     broken_off = False
 
-    def hear(name: str) -> None:
+    def hear(why: str) -> None:
         nonlocal broken_off
-        ending.ask(name)
+        ending.ask(why)
         if ending.connecting and not broken_off:
             broken_off = True
             task.cancel()
+
+    def end(why: str) -> None:
+        if not loop.is_closed():  # else the process is ending already
+            loop.call_soon_threadsafe(hear, why)
 
     handlers = {signal.SIGINT: hear, signal.SIGTERM: hear, signal.SIGHUP: lambda name: reload()}
     for number, handler in handlers.items():
         loop.add_signal_handler(number, handler, number.name)
     try:
-        yield
+        yield end
     except asyncio.CancelledError:
         if not broken_off or task.uncancel() > 0:
             raise

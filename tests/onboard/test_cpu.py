@@ -13,6 +13,9 @@ import pytest
 from drivers.threads import named
 from onboard.cpu import OTHER, PARTS, CpuMeter, Used, part, shares, threads
 
+#: Never set: a wait for it passes time.
+PAUSE = threading.Event()
+
 
 @pytest.mark.parametrize(
     ("name", "owner"),
@@ -53,7 +56,7 @@ def working(name: str, work: Callable[[], object]) -> Iterator[threading.Thread]
 
 
 def test_threads_are_found_by_name_and_with_what_they_used() -> None:
-    with working("recorder", lambda: time.sleep(0.001)) as thread:
+    with working("recorder", lambda: PAUSE.wait(0.001)) as thread:
         assert thread.native_id is not None
         found = threads()[thread.native_id]
         assert found.name == "recorder"
@@ -73,7 +76,7 @@ def test_the_one_that_works_has_the_share() -> None:
         end = time.monotonic() + 30.0
         while not meter.latest():
             assert time.monotonic() < end
-            time.sleep(0.05)
+            PAUSE.wait(0.05)
         latest, mean = meter.latest(), meter.mean()
     meter.stop()
     meter.stop()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
+from collections.abc import Callable
+from threading import Thread
 
 import pytest
 from msgspec.structs import replace
@@ -220,11 +221,11 @@ def test_signals_reach_the_ending_and_the_reload() -> None:
         with signals(run.ending, lambda: reloads.append(1)):
             assert run.tick(Phase.HOLD)
             for number in (signal.SIGHUP, signal.SIGTERM):
-                os.kill(os.getpid(), number)
+                signal.raise_signal(number)
             while not (reloads and run.requests):
                 await asyncio.sleep(0.001)
                 assert run.tick(Phase.HOLD)
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
             goes_on = True
             while goes_on:
                 await asyncio.sleep(0.001)
@@ -243,16 +244,30 @@ def test_before_the_first_tick_connecting_is_broken_off_and_the_devices_released
     async def flight() -> str:
         with signals(run.ending, lambda: None):
             try:
-                os.kill(os.getpid(), signal.SIGTERM)
+                signal.raise_signal(signal.SIGTERM)
                 await asyncio.sleep(3600.0)
             finally:
-                os.kill(os.getpid(), signal.SIGTERM)  # an impatient second one does not break off the release
+                signal.raise_signal(signal.SIGTERM)  # an impatient second one does not break off the release
                 await asyncio.sleep(0.01)
                 released.append("devices")
         return "ended in order"
 
     assert asyncio.run(flight()) == "ended in order"
     assert released == ["devices"]
+
+
+def test_another_thread_asks_for_the_end_in_the_same_way() -> None:
+    run, ends = Run(), list[Callable[[str], None]]()
+
+    async def flight() -> str:
+        with signals(run.ending, lambda: None) as end:
+            ends.append(end)
+            Thread(target=end, args=("standard input has closed",)).start()
+            await asyncio.sleep(3600.0)
+        return "ended in order"
+
+    assert asyncio.run(flight()) == "ended in order"
+    ends[0]("too late to matter")
 
 
 def test_after_the_last_tick_the_release_is_not_broken_off() -> None:
@@ -263,7 +278,7 @@ def test_after_the_last_tick_the_release_is_not_broken_off() -> None:
             run.tick(Phase.STOPPED)
             run.ending.ask("SIGTERM")
             assert not run.tick(Phase.STOPPED)
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
             await asyncio.sleep(0.01)
             return "released"
 
