@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import datetime
+from math import inf
 from pathlib import Path
 
 from msgspec import Struct
@@ -62,11 +63,11 @@ async def fly(
     devices = FlightDevices(config)
     with Notifier() as notifier:
         flight = _Flight(config, options, devices, notifier, watch, say)
-        with signals(flight.ending, flight.reload):
+        with signals(flight.ending, flight.reload) as end:
             try:
                 notifier.status("connecting")
                 if options.attended:
-                    attended.watch(flight.order, lambda: flight.ending.ask("standard input has closed"))
+                    attended.watch(flight.order, lambda: end("standard input has closed"))
                 await devices.start(say)
                 await flight.run(log, load)
             finally:
@@ -97,6 +98,7 @@ class _Flight:
         self.began = False
         self._ready = False
         self._report_ns = 0
+        self._until = inf if options.duration is None else options.duration
         self.ending = Ending(self._request)
 
     def _request(self, request: Request) -> None:
@@ -120,17 +122,16 @@ class _Flight:
         """Tick until the flight is over."""
         config, clock, devices = self._config, self._clock, self._devices
         info = run_info(config, realtime=True, started=datetime.now().astimezone().isoformat(timespec="seconds"))
-        refused = ask(config.process)
         with Recorder(log, info, config, dump_config(config), t_ns=clock.now_ns(), background=True) as recorder:
             self._recorder = recorder
             self._loop = loop = Loop(devices, clock, config, recorder, timed=True)
             self._reloader = Reloader(load, loop)
             self._errand = Errand(loop.request, LONGEST) if self._options.mission else None
             devices.on_look = self._look
-            for sentence in refused:
+            self._cpu = CpuMeter()
+            for sentence in ask(config.process):
                 self._tell(Event(clock.now_ns(), "process", Severity.WARNING, sentence))
             self._first_ns = clock.now_ns()
-            self._cpu = CpuMeter()
             try:
                 with Collector(config.process) as self._collector:
                     await loop.run(self._on_tick)
@@ -163,11 +164,13 @@ class _Flight:
         return goes_on
 
     def _goes_on(self, outputs: Outputs, t: float) -> bool:
-        if self._options.duration is not None and t >= self._options.duration:
-            self.ending.ask(f"{self._options.duration:g} s are over")
-            self._options = Options(self._options.mission, None, self._options.attended)
-        mission = self._errand is None or self._errand.goes_on(outputs, t)
-        return self.ending.goes_on(outputs, t) and mission and not self._devices.lost
+        if t >= self._until:
+            self._until = inf
+            self.ending.ask(f"{t:.0f} s are over")
+        if self._errand is not None and not self._errand.goes_on(outputs, t):
+            self._errand = None
+            self.ending.ask("the errand is over")
+        return self.ending.goes_on(outputs, t) and not self._devices.lost
 
     def _tell_what_there_is(self, outputs: Outputs, now: int) -> None:
         if not self.began:
