@@ -96,9 +96,14 @@ class Desk:
             self._flight.send_signal(number)
 
 
-def start(arguments: Sequence[str], stdout: int | None = None, stderr: int | None = None) -> subprocess.Popen[str]:
+def start(
+    arguments: Sequence[str],
+    stdout: int | None = None,
+    stderr: int | None = None,
+    program: Sequence[str] = ("-m", "onboard"),
+) -> subprocess.Popen[str]:
     """Start an onboard process in a process group of its own, attended through its standard input."""
-    command = [sys.executable, "-P", "-m", "onboard", *arguments]
+    command = [sys.executable, "-P", *program, *arguments]
     child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, text=True, process_group=0)
     # Where the machine grants it (root, RLIMIT_RTPRIO), so that what else runs there is not what is measured.
     with suppress(OSError):

@@ -7,8 +7,9 @@ without satellites, as far as an offboard flight meets them:
   not to be had from vision alone; Land wants a local position; offboard attitude wants nothing but its signal.
 - What cannot run falls back: Hold, Return (wants home), Land, Descend (level, down at MPC_LAND_SPEED), termination.
 - While disarmed, PX4's land detector says landed. In offboard attitude it takes thrust under MPC_MANTHR_MIN and a
-  hundredth, without motion, for a landing; so any thrust above is a takeoff. In PX4's own modes its position controller
-  takes the thrust away on the ground; here, being on the ground and still stands for that.
+  hundredth, without motion, for a landing; so any thrust above is a takeoff. In PX4's own modes its velocity controller
+  takes the thrust away where the vehicle does not sink; here, standing still on the ground stands for that, or on
+  whatever else holds the vehicle up (an arm that hangs below the skids) for a time.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ class Action(IntEnum):
 _OFFBOARD_LOSS = {3: Action.RETURN, 4: Action.LAND, 5: Action.HOLD, 6: Action.TERMINATE, 7: Action.DISARM}
 _CONTROL_LOSS = {1: Action.HOLD, 2: Action.RETURN, 3: Action.LAND, 5: Action.TERMINATE, 6: Action.DISARM}
 _STAGE = 1.0 / 3.0  # s that each of ground contact, maybe landed and landed lasts before it is believed
+_UNWINDING = 2.0  # s until PX4's velocity controller has taken the thrust away from a vehicle that does not sink
 _LOW, _CRITICAL, _EMERGENCY = 1, 2, 3
 _BATTERY = {
     _LOW: (Severity.WARNING, "Low battery level, return advised"),
@@ -61,10 +63,11 @@ _NAMES = {FlightMode.OFFBOARD: "Offboard", FlightMode.HOLD: "Hold", FlightMode.L
 
 
 class _Held:
-    """True once a condition has held for a third of a second; false at once."""
+    """True once a condition has held for a while (s); false at once."""
 
-    def __init__(self, state: bool) -> None:
+    def __init__(self, state: bool, duration: float = _STAGE) -> None:
         self.state = state
+        self._duration = duration
         self._since: float | None = None
 
     def update(self, t: float, condition: bool) -> bool:
@@ -72,7 +75,7 @@ class _Held:
             self._since, self.state = None, False
         elif not self.state:
             self._since = t if self._since is None else self._since
-            self.state = t - self._since >= _STAGE - 1e-9
+            self.state = t - self._since >= self._duration - 1e-9
         return self.state
 
 
@@ -105,6 +108,7 @@ class Commander(Autopilot):
         self._blind = False
         self._now = 0.0
         self._contact, self._maybe, self._down = _Held(True), _Held(True), _Held(True)
+        self._unwound = _Held(False, _UNWINDING)
         self._took_off = False
         self._since_armed = 0.0
         self._down_since: float | None = None
@@ -282,7 +286,8 @@ class Commander(Autopilot):
         if self.mode is not FlightMode.OFFBOARD:
             # Own modes: contact counts once going down, and after it the position controller takes the thrust away.
             going_down = self.mode is FlightMode.LAND or self._maybe.state
-            resting = x[at.ON_GROUND] != 0.0 and speed_of(x) < self._parameter("LNDMC_Z_VEL_MAX") and going_down
+            still = going_down and speed_of(x) < self._parameter("LNDMC_Z_VEL_MAX")
+            resting = self._unwound.update(self._now, still) or (still and x[at.ON_GROUND] != 0.0)
             return resting, resting
         v_z = x[at.VELOCITY + 2] + self.velocity_error[2]
         rising_or_falling = abs(v_z) >= self._widened(self._parameter("LNDMC_Z_VEL_MAX"))

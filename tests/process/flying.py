@@ -45,6 +45,17 @@ BRISK = (
     "repair.hold=20",
 )
 
+#: The flight process, but for one thing: on SIGUSR1 the thread of the loop spins for ever.
+_STICKY = """
+import signal, sys
+def spin(number, frame):
+    while True:
+        pass
+signal.signal(signal.SIGUSR1, spin)
+from onboard.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
 
 class Flying:
     """World and flight process of one configuration. Use as a context manager."""
@@ -62,7 +73,8 @@ class Flying:
         self.client.start(PATIENCE)
         sets = [f"--set={path}={value}" for path, value in self.endpoints.items()]
         out = ["--out", str(self.folder), "--no-progress"]
-        self.flight = start(["fly", *self._common, *sets, "--attended", *out], stderr=subprocess.PIPE)
+        arguments = ["fly", *self._common, *sets, "--attended", *out]
+        self.flight = start(arguments, stderr=subprocess.PIPE, program=("-c", _STICKY))
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
         return self
