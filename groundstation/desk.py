@@ -21,7 +21,8 @@ WORLD_PATIENCE = 180.0
 #: A child that has been told to end gets this long, s.
 END_PATIENCE = 20.0
 _GLANCE = 0.2
-_PRIORITY = 10
+#: Real-time priorities. The world's is the higher one: a flight process that computes must not stop the world.
+_PRIORITY = {"world": 12, "fly": 10}
 
 
 class WorldError(Exception):
@@ -107,7 +108,7 @@ def start(
     child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, text=True, process_group=0)
     # Where the machine grants it (root, RLIMIT_RTPRIO), so that what else runs there is not what is measured.
     with suppress(OSError):
-        os.sched_setscheduler(child.pid, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+        os.sched_setscheduler(child.pid, os.SCHED_FIFO, os.sched_param(_PRIORITY[arguments[0]]))
     return child
 
 
