@@ -126,7 +126,6 @@ class _BatteryStatus(Struct):
 
 
 class _SysStatus(Struct, gc=False):
-    onboard_control_sensors_enabled: int
     onboard_control_sensors_health: int
 
 
@@ -180,6 +179,7 @@ class _Command(IntEnum):
     DO_SET_MODE = 176
     ARM_DISARM = 400
     SET_MESSAGE_INTERVAL = 511
+    REQUEST_MESSAGE = 512
 
 
 class _Ask(Struct, frozen=True, gc=False):
@@ -217,9 +217,11 @@ _ARM = _Ask("arming", _Command.ARM_DISARM, (1.0, 0.0))
 _DISARM = _Ask("disarming", _Command.ARM_DISARM, (0.0, 0.0))
 _KILL = _Ask("cutting the motors", _Command.ARM_DISARM, (0.0, _FORCE))
 
-#: Messages asked for beside attitude and IMU: name, id, Hz. The heartbeat tells arming and mode.
+# The heartbeat tells arming and mode. PX4 sends it once a second, whatever interval is asked for; but also on request.
+_HEARTBEAT = _Ask("a heartbeat", _Command.REQUEST_MESSAGE, (0.0,))
+
+#: Messages asked for beside attitude and IMU: name, id, Hz.
 _SLOW_STREAMS = (
-    ("HEARTBEAT", 0, 10.0),
     ("SYS_STATUS", 1, 2.0),
     ("LOCAL_POSITION_NED", 32, 50.0),
     ("TIMESYNC", 111, 50.0),  # PX4 wants 500 answers before it believes our clock
@@ -574,6 +576,7 @@ class Px4:
     async def _work(self) -> None:
         while True:
             await asyncio.sleep(_PERIOD)
+            self._send("COMMAND_LONG", _command_json(_HEARTBEAT))
             self._judge_rates()
             if self._wanted is Engage.KILL:
                 self._work_towards_kill()
@@ -756,7 +759,7 @@ class Px4:
         self._battery.put(_Battery(sum(cells) / 1000.0, remaining), now)
 
     def _on_health(self, m: _SysStatus, now: int) -> None:
-        self._health.put(bool(m.onboard_control_sensors_enabled & m.onboard_control_sensors_health & _PREARM), now)
+        self._health.put(bool(m.onboard_control_sensors_health & _PREARM), now)
 
     def _on_text(self, m: _StatusText, now: int) -> None:
         text = m.text.rstrip("\0")

@@ -39,7 +39,6 @@ _SENSORS = (
     | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
     | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
     | mavlink.MAV_SYS_STATUS_SENSOR_VISION_POSITION
-    | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 )
 _CAPABILITIES = (
     mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
@@ -92,8 +91,12 @@ class Streams:
         }
 
     def ask(self, number: int, microseconds: float) -> bool:
-        """MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops the stream, 0 is its default, else the interval."""
-        if number not in self.makers or not isfinite(microseconds):
+        """MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops the stream, 0 is its default, else the interval.
+
+        The heartbeat's cannot be set.
+        """
+        fixed = number == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+        if fixed or number not in self.makers or not isfinite(microseconds):
             return False
         if microseconds == 0.0:
             rate = DEFAULT_RATES.get(number, 0.0)
@@ -164,8 +167,8 @@ class Streams:
 
     def _sys_status(self) -> Any:
         t, healthy = self._world.time, _SENSORS
-        if self._commander.failures(t):
-            healthy &= ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
+        if not self._commander.failures(t):
+            healthy |= mavlink.MAV_SYS_STATUS_PREARM_CHECK  # which PX4 tells among the healthy only
         if not self._estimator.horizontal_valid(t):
             healthy &= ~mavlink.MAV_SYS_STATUS_SENSOR_VISION_POSITION
         return mavlink.MAVLink_sys_status_message(
