@@ -56,11 +56,17 @@ _AFTER_TRIP = 0.06  # s: the servos look at their watchdog every 20 ms
 class Dynamixel:
     """ServoDevice on five XC330, real or emulated.
 
-    ``clock`` gives nanoseconds and stamps the samples. ``command`` and ``latest`` may be called from any one thread.
+    ``clock`` gives nanoseconds and stamps the samples; ``port`` opens the port, now and after each loss. ``command``
+    and ``latest`` may be called from any one thread.
     A servo that is lost in flight keeps its last values in the samples and shows ``HardwareError.SILENT``.
     """
 
-    def __init__(self, settings: DynamixelSettings, clock: Callable[[], int] = monotonic_ns) -> None:
+    def __init__(
+        self,
+        settings: DynamixelSettings,
+        clock: Callable[[], int] = monotonic_ns,
+        port: Callable[[str, int, float], Port] = Port,
+    ) -> None:
         ids = [servo.id for servo in settings.servos]
         if len(set(ids)) < len(ids):
             raise DeviceError(f"servo bus: the ids {ids} are not all different")
@@ -68,6 +74,7 @@ class Dynamixel:
             raise DeviceError(f"servo bus: baud {settings.baud}; want one of {', '.join(map(str, xc330.BAUDS))}")
         self._settings = settings
         self._clock = clock
+        self._port = port
         self._servos = tuple(Servo(index, servo) for index, servo in enumerate(settings.servos))
         self._notices = Notices()
         self._teller = Teller(self._notices, clock)
@@ -152,7 +159,7 @@ class Dynamixel:
 
     def _connect(self) -> None:
         settings = self._settings
-        self._bus = bus = Bus(Port(settings.port, settings.baud, settings.reply_margin))
+        self._bus = bus = Bus(self._port(settings.port, settings.baud, settings.reply_margin))
         bus.patient(_ATTEMPTS, _PATIENCE)
         if hint := latency_hint(settings.port):
             self._teller.tell(Level.WARNING, hint)
@@ -186,17 +193,20 @@ class Dynamixel:
         while not self._stopping:
             self._wake.wait(self._rest())
             self._wake.clear()
-            command = self._fresh()
-            try:
-                if self._bus is None:
-                    self._reopen()
-                else:
-                    self._turn(self._bus, command)
-            except OSError as error:
-                self._lose(error)
+            self._once()
         if self._bus is not None:
             with suppress(OSError):
                 self._goals.relax(self._bus)
+
+    def _once(self) -> None:
+        command = self._fresh()
+        try:
+            if self._bus is None:
+                self._reopen()
+            else:
+                self._turn(self._bus, command)
+        except OSError as error:
+            self._lose(error)
 
     def _fresh(self) -> ServoCommand | None:
         """The command that waits, if it is not from before this process was stopped."""
@@ -278,7 +288,7 @@ class Dynamixel:
         settings = self._settings
         self._reopen_ns = now + round(settings.retry * 1e9)
         try:
-            self._bus = Bus(Port(settings.port, settings.baud, settings.reply_margin))
+            self._bus = Bus(self._port(settings.port, settings.baud, settings.reply_margin))
         except DeviceError:
             return
         self._teller.tell(Level.INFO, f"the servo bus adapter on {settings.port} is back")

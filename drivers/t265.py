@@ -84,7 +84,7 @@ class T265Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 _QUALITY = (-1, 33, 66, 100)
 _PERIOD = 0.05  # of the watchdog, s
 _CALM_NS = 1_000_000_000
-_OFF = ("enable_relocalization", "enable_pose_jumping")
+_OFF = {"enable_relocalization": "relocalisation", "enable_pose_jumping": "pose jumping"}
 
 
 class _Trouble:
@@ -244,6 +244,9 @@ class T265:
             self._recordings += 1
             record = _numbered(record, self._recordings)
         stream = _Stream(device, record, on_frame, on_end)
+        if stream.stubborn:
+            what = " and ".join(stream.stubborn)
+            self._tell(Level.WARNING, f"{what} cannot be switched off: its poses may jump when it knows a place again")
         with self._lock:
             if number == self._streams:
                 self._stream = stream
@@ -348,16 +351,17 @@ class T265:
 class _Stream:
     """An open pose stream. Everything here may block."""
 
+    stubborn: tuple[str, ...] = ()
+    """What the camera does not let itself be told to leave off."""
+
     def __init__(self, device: Any, record: str, on_frame: Callable[[Any], None], on_end: Callable[[], None]) -> None:
         rs = library()
         try:
             if record:
                 device = rs.recorder(record, device)
             sensor, profile = _pose_sensor(rs, device)
-            for name in _OFF:
-                option = getattr(rs.option, name)
-                if sensor.supports(option) and not sensor.is_option_read_only(option):
-                    sensor.set_option(option, 0.0)
+            if not device.is_playback():
+                self.stubborn = tuple(words for name, words in _OFF.items() if not _switched_off(rs, sensor, name))
             if device.is_playback():
                 device.as_playback().set_status_changed_callback(
                     lambda status: on_end() if status == rs.playback_status.stopped else None
@@ -421,6 +425,16 @@ def _pose_sensor(rs: Any, device: Any) -> tuple[Any, Any]:
             if profile.stream_type() == rs.stream.pose:
                 return sensor, profile
     raise DeviceError("tracker: the device has no pose stream; want a T265, or a recording of its poses")
+
+
+def _switched_off(rs: Any, sensor: Any, name: str) -> bool:
+    """It is off when it is read back."""
+    option = getattr(rs.option, name)
+    if not sensor.supports(option):
+        return False
+    if not sensor.is_option_read_only(option):
+        sensor.set_option(option, 0.0)
+    return bool(sensor.get_option(option) == 0.0)
 
 
 def _numbered(path: str, number: int) -> str:

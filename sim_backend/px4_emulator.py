@@ -36,7 +36,7 @@ from drivers.thrust import motor_signal, thrust_fraction
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.autopilot import SetPoint
-from sim_backend.faults import Fault, Faults, Kind, read_fault_file, read_faults
+from sim_backend.faults import Fault, Faults, Kind, add_fault_options, given_faults
 from sim_backend.mock_devices import MockAutopilot
 from sim_backend.motors import rated_voltage
 from sim_backend.pace import Pace
@@ -381,17 +381,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--bind", type=_address, default=("127.0.0.1", 14580), help="listens here, as PX4's SITL does")
     parser.add_argument("--peer", type=_address, default=("127.0.0.1", 14540), help="sends here unasked")
     parser.add_argument("--vehicle", type=Path, default=here, help="vehicle file")
-    parser.add_argument(
-        "--fault", action="append", default=[], help="as YAML: '{device: autopilot, kind: drop, start: 3, value: 0.2}'"
-    )
-    parser.add_argument("--faults", type=Path, help="YAML file with a list of faults")
+    add_fault_options(parser)
     parser.add_argument("--set", type=_change, action="append", default=[], help="a parameter: COM_OF_LOSS_T=1.0")
     parser.add_argument("--duration", type=float, default=None, help="seconds; none: until Ctrl-C")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
     try:
-        faults = [fault for text in given.fault for fault in read_faults(text, f"--fault {text}")]
-        faults += read_fault_file(given.faults) if given.faults else ()
+        faults = given_faults(given)
         try:
             vehicle = msgspec.convert(yaml.safe_load(given.vehicle.read_text(encoding="utf-8")), Vehicle)
         except (yaml.YAMLError, msgspec.ValidationError) as error:

@@ -113,13 +113,12 @@ class Link:
         if self._faults.find(Kind.SILENT, t) is not None:
             packets = []
         packets = [self._damaged(packet, t) for packet in packets if not self._struck(Kind.DROP, t)]
-        delay = self._faults.find(Kind.DELAY, t)
-        if delay is not None or self._late:
-            due = t + (0.0 if delay is None else delay.value)
-            self._late.extend((due, packet) for packet in packets)
-            packets = []
-            while self._late and self._late[0][0] <= t:
-                packets.append(self._late.popleft()[1])
+        for packet in packets:
+            delay = self._faults.strike(Kind.DELAY, t)
+            self._late.append((t + (0.0 if delay is None else delay.value), packet))
+        packets = []
+        while self._late and self._late[0][0] <= t:
+            packets.append(self._late.popleft()[1])
         batch = b""
         for packet in (*packets, b""):
             if batch and (not packet or len(batch) + len(packet) > _MAX_DATAGRAM):
@@ -128,8 +127,7 @@ class Link:
             batch += packet
 
     def _struck(self, kind: Kind, t: float) -> bool:
-        fault = self._faults.find(kind, t)
-        return fault is not None and self._random.random() < fault.value
+        return self._faults.strike(kind, t, chance=self._random.random()) is not None
 
     def _damaged(self, packet: bytes, t: float) -> bytes:
         if not self._struck(Kind.CORRUPT, t):

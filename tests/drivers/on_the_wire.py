@@ -7,11 +7,12 @@ from typing import cast
 
 from drivers import xc330
 from drivers.dynamixel import Dynamixel
-from drivers.dynamixel_bus import Bus, Port
+from drivers.dynamixel_bus import Port
 from drivers.dynamixel_settings import DynamixelSettings
+from drivers.protocols import DeviceError
 from drivers.samples import ServoCommand, ServoState
 from sim_backend.dynamixel_bus import DynamixelBus
-from sim_backend.dynamixel_mechanics import FreeServos
+from sim_backend.dynamixel_mechanics import FreeServos, Mechanics
 from sim_backend.dynamixel_servo import Servo
 from sim_backend.dynamixel_wire import Parser
 from sim_backend.faults import Kind
@@ -32,6 +33,7 @@ class Wire:
         """Answers that come only when the next question has been asked."""
         self.hold_back = 0
         """So many of the next answers are late."""
+        self.plugged = True
         self._servos = servos
         self._baud = baud
         self._latency = latency
@@ -55,6 +57,8 @@ class Wire:
         self._answer = b""
 
     def writePort(self, packet: Sequence[int]) -> int:
+        if not self.plugged:
+            raise OSError("the serial adapter is gone")
         self._sent = len(packet)
         now = self._pass(len(packet))
         for each in self._parser.feed(bytes(packet)):
@@ -85,24 +89,34 @@ class Wire:
 
 
 class Bench:
-    """Driver, servos and the wire between them; ``settings`` as for the real bus."""
+    """Driver, servos and the wire between them; the servos turn ``mechanics``, or nothing."""
 
-    def __init__(self, settings: DynamixelSettings, latency: float = 0.0) -> None:
+    def __init__(self, settings: DynamixelSettings, latency: float = 0.0, mechanics: Mechanics | None = None) -> None:
         self.settings = settings
         servos = [Servo(mount.id) for mount in settings.servos]
         self.free = FreeServos(tuple(mount.zero * xc330.RAD_PER_COUNT for mount in settings.servos))
-        self.bus = DynamixelBus(servos, self.free)
+        self.bus = DynamixelBus(servos, mechanics or self.free)
         self.wire = Wire(self.bus, settings.baud, settings.reply_margin, latency)
-        self.driver = Dynamixel(settings, clock=lambda: round(self.wire.now * 1e9))
-        self.real = self.driver._bus = Bus(cast(Port, self.wire))
-        for servo in self.driver._servos:
-            self.driver._set_up.set_up(self.real, servo)
-            servo.heard_ns = round(self.wire.now * 1e9)
+        self.plugged = True
+        self.driver = Dynamixel(settings, lambda: round(self.wire.now * 1e9), self._open)
+        self.driver._connect()
+
+    def _open(self, path: str, baud: int, margin: float) -> Port:
+        if not self.plugged:
+            raise DeviceError("not plugged in")
+        return cast(Port, self.wire)
+
+    def once(self, command: ServoCommand | None = None) -> None:
+        """What the driver's thread does with this command."""
+        self.wire.plugged = self.plugged
+        if command is not None:
+            self.driver._command = (command, round(self.wire.now * 1e9))
+        self.driver._once()
 
     def cycle(self, command: ServoCommand | None = None) -> ServoState | None:
         """One, 4 ms after the last one or as soon as it is over; its sample if it made one."""
         began = self.wire.now
-        self.driver._turn(self.real, command)
+        self.once(command)
         ended = self.wire.now
         self.wire.now = max(began + 0.004, self.wire.now)
         self.bus.update(self.wire.now)

@@ -44,6 +44,7 @@ from drivers.xc330 import HardwareError, Mode
 from sim_backend.dynamixel_emulator import DynamixelEmulator, emulate
 from sim_backend.dynamixel_mechanics import FreeServos
 from sim_backend.dynamixel_servo import Servo
+from sim_backend.dynamixel_troubles import KINDS
 from sim_backend.faults import Kind
 
 pytestmark = pytest.mark.asyncio
@@ -508,6 +509,44 @@ async def test_a_silent_servo_is_told_once_the_others_go_on_and_its_return_is_to
     rig.emulator.faults.clear()
     await rig.until(lambda: rig.state().error == (0,) * 5 and rig.state().torque_on, lambda: command(position=new))
     assert sum("theta_2 (id 7) answers again" in text for text in rig.texts()) == 1
+
+
+#: Each fault of the bus: for how long, how much and where, and what of it is told.
+FAULTS: dict[Kind, tuple[float, float, str, tuple[str, ...]]] = {
+    Kind.DROP: (0.5, 0.1, "", ("a reading of the servos failed",)),
+    Kind.CORRUPT: (0.5, 0.1, "", ("a reading of the servos failed",)),
+    Kind.TRUNCATE: (0.5, 0.1, "", ("a reading of the servos failed",)),
+    Kind.WRONG_ID: (0.5, 0.1, "", ("a reading of the servos failed",)),
+    Kind.DELAY: (0.5, 0.06, "", ("a reading of the servos failed",)),
+    Kind.SILENT: (0.5, 0.0, "theta_2", ("theta_2 (id 7) does not answer any more", "theta_2 (id 7) answers again")),
+    Kind.ERROR_BIT: (
+        0.0, HardwareError.OVERLOAD, "pump", ("pump (id 9): overload", "reboot 1 of 3", "answers again, restarted"),
+    ),
+    Kind.REBOOT: (0.5, 0.0, "theta_3", ("theta_3 (id 4) does not answer any more", "answers again, restarted")),
+    Kind.UNPLUGGED: (0.5, 0.0, "", ("the servo bus adapter on", "is back")),
+}  # fmt: skip
+
+
+async def test_every_fault_of_the_bus_is_here() -> None:
+    assert set(FAULTS) == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+async def test_each_fault_is_survived_told_and_recovered_from(rig: Rig, kind: Kind) -> None:
+    """Told once, or while it comes and goes, no more than once for each servo and way."""
+    duration, value, part, expected = FAULTS[kind]
+    await rig.until(lambda: rig.state().position == pytest.approx(GOALS, abs=0.01), command)
+    rig.texts()
+    rig.told.clear()
+    rig.emulator.inject(kind, duration, value, part)
+    over = rig.emulator.time + duration
+    await rig.until(lambda: rig.emulator.time > over and all(rig.heard(text) for text in expected), command)
+    await rig.until(lambda: rig.state().torque_on and rig.state().error == (0,) * 5, command)
+    await rig.until(lambda: rig.state().position == pytest.approx(GOALS, abs=0.01), command)
+    last = rig.state().t_ns
+    await rig.until(lambda: rig.state().t_ns > last, command)
+    assert sum(expected[0] in text and "is back" not in text for text in rig.texts()) == 1
+    assert len(rig.texts()) < 20
 
 
 async def test_all_silent_is_one_sentence_and_no_samples(rig: Rig) -> None:

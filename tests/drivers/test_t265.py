@@ -22,7 +22,7 @@ from drivers.t265 import T265, T265Settings, Variances
 from drivers.vehicle import Vehicle
 from sim_backend.faults import Kind
 from sim_backend.t265_emulator import T265Emulator
-from sim_backend.tracker import PERIOD
+from sim_backend.tracker import KINDS, PERIOD
 from sim_backend.world import World
 
 rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 cannot be imported here", exc_type=ImportError)
@@ -128,6 +128,36 @@ async def test_relocalisation_and_pose_jumping_are_switched_off() -> None:
     await bench.start()
     assert [sensor.get_option(option) for option in options] == [0.0, 0.0]
     await bench.driver.stop()
+    assert bench.told == []
+
+
+class Stubborn:
+    """A device whose sensor takes an option and shows that it did not."""
+
+    def __init__(self, device: Any) -> None:
+        self._device = device
+        self._sensor = device.query_sensors()[0]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._device if name == "is_playback" else self._sensor, name)
+
+    def query_sensors(self) -> list[Any]:
+        return [self]
+
+    def get_option(self, option: Any) -> float:
+        return 1.0 if option == rs.option.enable_pose_jumping else 0.0
+
+
+async def test_an_option_that_is_not_taken_is_told() -> None:
+    bench = Bench(wrap=Stubborn)
+    await bench.start()
+    await bench.driver.stop()
+    assert bench.told == [
+        (
+            Level.WARNING,
+            "tracker: pose jumping cannot be switched off: its poses may jump when it knows a place again",
+        )
+    ]
 
 
 async def test_poses_come_at_200_hz_and_are_counted() -> None:
@@ -219,6 +249,46 @@ async def test_an_unplugged_camera_is_told_once_and_comes_back() -> None:
     assert bench.sample().reset_counter == 1
 
 
+LOST = "no usable pose for 0.2 s; opening it again"
+BACK = "it is back after"
+#: Each fault of the camera: for how long and how much, and what of it is told, each once.
+FAULTS: dict[Kind, tuple[float, float, tuple[str, ...]]] = {
+    Kind.DROP: (0.5, 0.5, ()),
+    Kind.DELAY: (0.4, 0.05, ()),
+    # A frozen pose is finite and fresh: the core knows it by its bits.
+    Kind.FREEZE: (0.5, 0.0, ()),
+    Kind.JUMP: (0.5, 0.3, ("its pose has jumped by 0.30 m", "no more jumps; there were 1")),
+    # Nothing tells slow drift from motion.
+    Kind.DRIFT: (0.5, 0.1, ()),
+    Kind.NAN: (0.1, 0.0, ("a pose is not used: it is not finite", "its poses are usable again")),
+    Kind.CONFIDENCE: (0.5, 1.0, ()),
+    Kind.SILENT: (0.4, 0.0, (LOST, BACK)),
+    Kind.UNPLUGGED: (1.5, 0.0, (LOST, "cannot open it again: no T265 found", BACK)),
+    Kind.REBOOT: (1.5, 0.0, (LOST, "cannot open it again: no T265 found", BACK)),
+}
+
+
+async def test_every_fault_of_the_camera_is_here() -> None:
+    assert set(FAULTS) == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+async def test_each_fault_is_survived_told_once_and_recovered_from(kind: Kind) -> None:
+    duration, value, expected = FAULTS[kind]
+    bench = Bench()
+    await bench.start()
+    bench.inject(kind, duration, value)
+    over = bench.world.snapshot.t_ns + round((duration + 0.5) * 1e9)
+    await bench.until(lambda: all(bench.count(text) for text in expected))
+    await bench.until(lambda: bench.sample().t_ns > over)
+    await bench.driver.stop()
+    assert [text for _, text in bench.told if not any(each in text for each in expected)] == []
+    assert {text: bench.count(text) for text in expected} == dict.fromkeys(expected, 1)
+    assert bench.sample().confidence == 3
+    lost = kind in (Kind.JUMP, Kind.SILENT, Kind.UNPLUGGED, Kind.REBOOT)
+    assert bench.sample().reset_counter == lost
+
+
 class Hanging:
     """A device whose sensor does not come back from being stopped before it is let go."""
 
@@ -300,7 +370,13 @@ class Script:
         return [SimpleNamespace(stream_type=lambda: rs.stream.pose)]
 
     def supports(self, option: Any) -> bool:
-        return False
+        return True
+
+    def is_option_read_only(self, option: Any) -> bool:
+        return True
+
+    def get_option(self, option: Any) -> float:
+        return 0.0
 
     def is_playback(self) -> bool:
         return False
