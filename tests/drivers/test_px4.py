@@ -21,6 +21,7 @@ from drivers.px4 import Px4, Px4Settings
 from drivers.samples import AutopilotCommand, Engage, FlightMode, Interface, Odometry, Quat, Vec3
 from drivers.thrust import ThrustMap
 from drivers.vehicle import Vehicle
+from sim_backend import layout as at
 from sim_backend.px4_commander import Severity
 from sim_backend.px4_emulator import Px4StandIn
 from sim_backend.world import World
@@ -285,12 +286,18 @@ async def test_asked_rates_are_reached(pair: tuple[Px4, Px4StandIn]) -> None:
         lambda: all(px4.counts()[name].rate > 200.0 for name in ("ATTITUDE_QUATERNION", "HIGHRES_IMU")), within=10.0
     )
     assert px4.motion() is not None
-    assert px4.ready_to_arm()
+
+
+async def test_ready_to_arm_is_of_the_present_mode(pair: tuple[Px4, Px4StandIn]) -> None:
+    """PX4 in Hold without a global position is not; in offboard, with set-points, it is."""
+    px4, _ = pair
+    assert not px4.ready_to_arm()
+    await until(px4.ready_to_arm, lambda: px4.command(command()))
 
 
 async def test_offboard_is_not_taken_back_from_a_pilot(pair: tuple[Px4, Px4StandIn]) -> None:
     px4, stand_in = pair
-    autopilot = stand_in.world.autopilot
+    commander = stand_in.commander
 
     def state() -> tuple[bool, FlightMode]:
         latest = px4.latest()
@@ -301,26 +308,27 @@ async def test_offboard_is_not_taken_back_from_a_pilot(pair: tuple[Px4, Px4Stand
         px4.command(command())
 
     await until(lambda: state() == (True, FlightMode.OFFBOARD), tick)
-    autopilot.mode = FlightMode.HOLD  # the pilot's switch
-    await until(lambda: state()[1] is FlightMode.HOLD, tick)
+    commander.mode = FlightMode.LAND  # the pilot's switch
+    await until(lambda: state()[1] is FlightMode.LAND, tick)
     sent = px4.sent()
     await until(lambda: px4.sent() > sent + 500, tick)
-    assert autopilot.mode is FlightMode.HOLD
+    assert commander.mode is FlightMode.LAND
     assert sum("has left offboard by itself" in n.text for n in px4.notices()) == 1
-    await until(lambda: not state()[0], lambda: px4.command(command(Engage.LAND)))
+    px4.command(command(Engage.LAND))
+    await until(lambda: not state()[0])
     await until(lambda: state() == (True, FlightMode.OFFBOARD), tick)
 
 
 async def test_a_refusal_is_told_with_px4s_reason(pair: tuple[Px4, Px4StandIn]) -> None:
     px4, stand_in = pair
-    stand_in.commander.terminated = True
+    stand_in.world.plant.x[at.CHARGE] = 0.05
     told: list[str] = []
 
     def tick() -> None:
         px4.command(command())
         told.extend(n.text for n in px4.notices())
 
-    want = {"autopilot: arming: temporarily rejected", "PX4: Preflight Fail: Flight termination active"}
+    want = {"autopilot: arming: temporarily rejected", "PX4: Preflight Fail: Low battery level"}
     await until(lambda: want <= set(told), tick)
 
 
