@@ -135,12 +135,12 @@ ATTITUDES = {
     # nose down by 60 degrees: thrust leans ahead, +x of W, which is east
     "pitched forward, facing east": (
         (cos(pi / 6), 0.0, sin(pi / 6), 0.0),
-        (0.612372, 0.353553, -0.353553, 0.612372),
+        (6**0.5 / 4, 2**0.5 / 4, -(2**0.5) / 4, 6**0.5 / 4),
         (0.0, sin(pi / 3), -cos(pi / 3)),
     ),
     # right side down by 60 degrees, facing north: thrust leans to the right, east
     "rolled right, facing north": (
-        (0.612372, 0.353553, 0.353553, 0.612372),
+        (6**0.5 / 4, 2**0.5 / 4, 2**0.5 / 4, 6**0.5 / 4),
         (cos(pi / 6), sin(pi / 6), 0.0, 0.0),
         (0.0, sin(pi / 3), -cos(pi / 3)),
     ),
