@@ -2,74 +2,34 @@
 
 from __future__ import annotations
 
-import asyncio
 import struct
 import time
-from collections.abc import AsyncIterator, Callable
-from math import inf, isnan, nan
-from pathlib import Path
+from collections.abc import AsyncIterator
+from math import cos, inf, isnan, nan, pi, sin
 from socket import AF_INET, SOCK_DGRAM, socket
 
 import msgspec
 import pytest
 import pytest_asyncio
-import yaml
 
 from drivers.mailbox import Level
 from drivers.protocols import DeviceError
 from drivers.px4 import Px4, Px4Settings
-from drivers.samples import AutopilotCommand, Engage, FlightMode, Interface, Odometry, Quat, Vec3
-from drivers.thrust import ThrustMap
-from drivers.vehicle import Vehicle
+from drivers.rotation import rotate
+from drivers.samples import AutopilotCommand, Engage, FlightMode, Interface, Odometry
+from sim_backend import layout as at
 from sim_backend.px4_commander import Severity
 from sim_backend.px4_emulator import Px4StandIn
 from sim_backend.world import World
+from tests.drivers.px4_rig import LEVEL, VEHICLE, command, linked, settings, until
 
 pytestmark = pytest.mark.asyncio
-
-VEHICLE = msgspec.convert(
-    yaml.safe_load((Path(__file__).parents[2] / "configs" / "vehicle.yaml").read_text(encoding="utf-8")), Vehicle
-)
-THRUST = ThrustMap(hover_force=20.0, hover_thrust=0.4, hover_voltage=16.0, curve=0.3, px4_curve=0.3)
-LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
-STILL: Vec3 = (0.0, 0.0, 0.0)
-
-
-def settings(url: str, **changes: float) -> Px4Settings:
-    return msgspec.structs.replace(Px4Settings(thrust=THRUST, url=url, stream_time=0.6), **changes)
-
-
-def command(
-    engage: Engage = Engage.OFFBOARD,
-    thrust: float = 5.0,
-    interface: Interface = Interface.ATTITUDE,
-    q_WB: Quat = LEVEL,
-    w_WB_B: Vec3 = STILL,
-) -> AutopilotCommand:
-    return AutopilotCommand(engage, interface, thrust, STILL, q_WB, w_WB_B)
-
-
-async def until(condition: Callable[[], bool], tick: Callable[[], None] = lambda: None, within: float = 15.0) -> None:
-    """Tick every 4 ms until the condition holds."""
-    loop = asyncio.get_running_loop()
-    end = loop.time() + within
-    while not condition():
-        assert loop.time() < end, "the condition never held"
-        tick()
-        await asyncio.sleep(0.004)
 
 
 @pytest_asyncio.fixture
 async def pair() -> AsyncIterator[tuple[Px4, Px4StandIn]]:
-    stand_in = Px4StandIn(World(VEHICLE))
-    stand_in.start()
-    px4 = Px4(settings(f"udpout://127.0.0.1:{stand_in.port}"))
-    try:
-        await px4.start()
-        yield px4, stand_in
-    finally:
-        await px4.stop()
-        stand_in.stop()
+    async with linked(Px4StandIn(World(VEHICLE))) as found:
+        yield found
 
 
 def free_port() -> int:
@@ -164,6 +124,43 @@ async def test_the_bytes_of_a_body_rate_set_point(pair: tuple[Px4, Px4StandIn]) 
     assert (roll, pitch, yaw) == pytest.approx((0.1, -0.2, -0.3), abs=1e-6)
     assert thrust == pytest.approx(0.5, abs=1e-6)
     assert (system, component, mask) == (1, 1, 0b1000_0000)
+
+
+ROOT_HALF = 0.5**0.5
+#: q_WB; the wire's quaternion (FRD to NED), worked by hand; where in NED the thrust axis (-z of FRD) points by it.
+ATTITUDES = {
+    "level, facing east": (LEVEL, (ROOT_HALF, 0.0, 0.0, ROOT_HALF), (0.0, 0.0, -1.0)),
+    "level, facing north": ((ROOT_HALF, 0.0, 0.0, ROOT_HALF), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    "level, facing west": ((0.0, 0.0, 0.0, 1.0), (ROOT_HALF, 0.0, 0.0, -ROOT_HALF), (0.0, 0.0, -1.0)),
+    # nose down by 60 degrees: thrust leans ahead, +x of W, which is east
+    "pitched forward, facing east": (
+        (cos(pi / 6), 0.0, sin(pi / 6), 0.0),
+        (6**0.5 / 4, 2**0.5 / 4, -(2**0.5) / 4, 6**0.5 / 4),
+        (0.0, sin(pi / 3), -cos(pi / 3)),
+    ),
+    # right side down by 60 degrees, facing north: thrust leans to the right, east
+    "rolled right, facing north": (
+        (6**0.5 / 4, 2**0.5 / 4, 2**0.5 / 4, 6**0.5 / 4),
+        (cos(pi / 6), sin(pi / 6), 0.0, 0.0),
+        (0.0, sin(pi / 3), -cos(pi / 3)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ATTITUDES)
+async def test_attitudes_on_the_wire(pair: tuple[Px4, Px4StandIn], name: str) -> None:
+    """Set-point and pose alike carry the quaternion that was worked by hand, and its thrust points where it should."""
+    px4, stand_in = pair
+    q_WB, want, axis = ATTITUDES[name]
+    px4.command(command(q_WB=q_WB))
+    px4.odometry(msgspec.structs.replace(POSE, q_WB=q_WB), 1e-3, 1e-3, 1e-3, 100)
+    await until(lambda: {"SET_ATTITUDE_TARGET", "ODOMETRY"} <= set(stand_in.newest))
+    set_point = bytes(stand_in.newest["SET_ATTITUDE_TARGET"].get_msgbuf())[10:]
+    pose = bytes(stand_in.newest["ODOMETRY"].get_msgbuf())[10:]
+    for q in (struct.unpack("<4f", set_point[4:20]), struct.unpack("<4f", pose[20:36])):
+        sign = 1.0 if sum(a * b for a, b in zip(q, want, strict=True)) > 0.0 else -1.0
+        assert [sign * c for c in q] == pytest.approx(want, abs=1e-6)
+        assert rotate(q, (0.0, 0.0, -1.0)) == pytest.approx(axis, abs=1e-6)
 
 
 POSE = Odometry(
@@ -285,12 +282,18 @@ async def test_asked_rates_are_reached(pair: tuple[Px4, Px4StandIn]) -> None:
         lambda: all(px4.counts()[name].rate > 200.0 for name in ("ATTITUDE_QUATERNION", "HIGHRES_IMU")), within=10.0
     )
     assert px4.motion() is not None
-    assert px4.ready_to_arm()
+
+
+async def test_ready_to_arm_is_of_the_present_mode(pair: tuple[Px4, Px4StandIn]) -> None:
+    """PX4 in Hold without a global position is not; in offboard, with set-points, it is."""
+    px4, _ = pair
+    assert not px4.ready_to_arm()
+    await until(px4.ready_to_arm, lambda: px4.command(command()))
 
 
 async def test_offboard_is_not_taken_back_from_a_pilot(pair: tuple[Px4, Px4StandIn]) -> None:
     px4, stand_in = pair
-    autopilot = stand_in.world.autopilot
+    commander = stand_in.commander
 
     def state() -> tuple[bool, FlightMode]:
         latest = px4.latest()
@@ -301,26 +304,27 @@ async def test_offboard_is_not_taken_back_from_a_pilot(pair: tuple[Px4, Px4Stand
         px4.command(command())
 
     await until(lambda: state() == (True, FlightMode.OFFBOARD), tick)
-    autopilot.mode = FlightMode.HOLD  # the pilot's switch
-    await until(lambda: state()[1] is FlightMode.HOLD, tick)
+    commander.mode = FlightMode.LAND  # the pilot's switch
+    await until(lambda: state()[1] is FlightMode.LAND, tick)
     sent = px4.sent()
     await until(lambda: px4.sent() > sent + 500, tick)
-    assert autopilot.mode is FlightMode.HOLD
+    assert commander.mode is FlightMode.LAND
     assert sum("has left offboard by itself" in n.text for n in px4.notices()) == 1
-    await until(lambda: not state()[0], lambda: px4.command(command(Engage.LAND)))
+    px4.command(command(Engage.LAND))
+    await until(lambda: not state()[0])
     await until(lambda: state() == (True, FlightMode.OFFBOARD), tick)
 
 
 async def test_a_refusal_is_told_with_px4s_reason(pair: tuple[Px4, Px4StandIn]) -> None:
     px4, stand_in = pair
-    stand_in.commander.terminated = True
+    stand_in.world.plant.x[at.CHARGE] = 0.05
     told: list[str] = []
 
     def tick() -> None:
         px4.command(command())
         told.extend(n.text for n in px4.notices())
 
-    want = {"autopilot: arming: temporarily rejected", "PX4: Preflight Fail: Flight termination active"}
+    want = {"autopilot: arming: temporarily rejected", "PX4: Preflight Fail: Low battery level"}
     await until(lambda: want <= set(told), tick)
 
 

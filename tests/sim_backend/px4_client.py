@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from drivers.frames import px4_from_attitude, px4_from_body, px4_from_world
 from drivers.rotation import inverse, rotate
-from drivers.samples import FlightMode, Vec3
+from drivers.samples import FlightMode, Landed, Vec3
 from sim_backend.px4_emulator import Px4StandIn
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
@@ -101,6 +101,9 @@ class Client:
 
     def armed(self) -> bool:
         return self.world.autopilot.armed
+
+    def landed(self) -> Landed:
+        return self.world.autopilot.landed
 
     def texts(self) -> list[str]:
         """Status texts so far, those in pieces joined."""

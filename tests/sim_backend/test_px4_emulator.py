@@ -150,7 +150,7 @@ def test_silence_lands_and_disarms(client: Client) -> None:
     assert "Failsafe activated: switching to Land (No offboard signal)" in client.told()
     client.run(8.0)
     assert client.texts()[-2:] == ["Landing detected", "Disarmed by landing"]
-    assert client.world.autopilot.landed is Landed.ON_GROUND
+    assert client.landed() is Landed.ON_GROUND
     assert not client.armed()
     assert not client.world.truth().crashed
     assert client.command(ARM, 1.0) == REJECTED
@@ -219,24 +219,20 @@ def test_hold_with_a_global_position(vehicle: Vehicle) -> None:
 
 def test_little_thrust_without_motion_is_a_landing(client: Client) -> None:
     """PX4's land detector in attitude offboard: no descent need be commanded, and no ground be there."""
-
-    def landed() -> Landed:
-        return client.world.autopilot.landed
-
     client.fly()
-    assert landed() is Landed.IN_AIR
+    assert client.landed() is Landed.IN_AIR
     x = client.world.plant.x
     for _ in range(300):
         x[at.VELOCITY : at.VELOCITY + 3] = 0.0  # something holds the vehicle
         client.run(0.004, 0.15)
-    assert landed() is Landed.IN_AIR  # above MPC_MANTHR_MIN: contact, but no landing
+    assert client.landed() is Landed.IN_AIR  # above MPC_MANTHR_MIN: contact, but no landing
     for _ in range(280):
         x[at.VELOCITY : at.VELOCITY + 3] = 0.0
         client.run(0.004, 0.08)
-    assert landed() is Landed.ON_GROUND
+    assert client.landed() is Landed.ON_GROUND
     assert client.texts()[-1] == "Landing detected"
     client.run(0.02, 0.3)
-    assert landed() is Landed.IN_AIR
+    assert client.landed() is Landed.IN_AIR
 
 
 def test_who_does_not_take_off_is_disarmed(vehicle: Vehicle) -> None:
