@@ -1,7 +1,7 @@
 """What PX4's commander and land detector decide: modes, arming checks, failsafes, landing, battery.
 
-The rules are those of PX4 v1.16 (modules commander and land_detector) for a multicopter without a pilot's sticks and
-without satellites, as far as an offboard flight meets them:
+The rules are those of PX4's main branch of May 2025, towards v1.16 (modules commander and land_detector), for a
+multicopter without a pilot's sticks and without satellites, as far as an offboard flight meets them:
 
 - Disarmed, any mode may be chosen; armed, only one that can run. Hold wants a local and a global position, the latter
   not to be had from vision alone; Land wants a local position; offboard attitude wants nothing but its signal.

@@ -52,9 +52,9 @@ def fly(master: Any, seconds: float, thrust: float) -> None:
         master.mav.set_attitude_target_send(
             0, master.target_system, master.target_component, 7, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, thrust
         )
-        while master.recv_match(blocking=False) is not None:
-            pass
-        time.sleep(0.02)
+        due = time.monotonic() + 0.02
+        while (left := due - time.monotonic()) > 0.0:
+            master.recv_match(blocking=True, timeout=left)
 
 
 def main() -> None:

@@ -160,7 +160,7 @@ def test_it_hovers_and_descends_by_itself(vehicle: Vehicle) -> None:
     assert world.truth().v_WB == pytest.approx((0.0, 0.0, 0.0), abs=0.01)
     world.autopilot.mode = FlightMode.LAND
     world.advance(3.0)
-    assert world.truth().v_WB[2] == pytest.approx(-0.5, abs=0.05)
+    assert world.truth().v_WB[2] == pytest.approx(-0.6, abs=0.05)
 
 
 def test_inertia_of_the_airframe_is_about_its_centre_of_mass(vehicle: Vehicle) -> None:

@@ -8,9 +8,9 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Event
 from typing import IO
 
 import pytest
@@ -68,11 +68,18 @@ def until(stream: IO[str], pattern: str) -> str:
     pytest.fail(f"{pattern} never came: {read}")
 
 
-def test_mavproxy_connects(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_mavproxy_connects(vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = shutil.which("mavproxy.py", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")
     if found is None:
         pytest.skip("MAVProxy is not installed (pip install MAVProxy: it brings 0.6 GB with it)")
     stand_in = Px4StandIn(World(vehicle))
+    changed, change = Event(), stand_in.parameters.set_wire
+
+    def set_wire(name: str, field: float) -> None:
+        change(name, field)
+        changed.set()
+
+    monkeypatch.setattr(stand_in.parameters, "set_wire", set_wire)
     stand_in.start()
     try:
         with subprocess.Popen(
@@ -92,9 +99,7 @@ def test_mavproxy_connects(vehicle: Vehicle, tmp_path: Path) -> None:
                 process.stdin.write("param show COM_OF_LOSS_T\nparam set COM_OF_LOSS_T 0.8\n")
                 process.stdin.flush()
                 until(process.stdout, r"COM_OF_LOSS_T +0\.5")
-                end = time.monotonic() + 20.0
-                while stand_in.parameters["COM_OF_LOSS_T"] == 0.5 and time.monotonic() < end:
-                    time.sleep(0.05)
+                assert changed.wait(20.0)
             finally:
                 process.stdin.close()
                 process.terminate()
