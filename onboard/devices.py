@@ -28,8 +28,8 @@ from sim_backend.world import World
 from sim_backend.world_client import LinkedAutopilot, LinkedOdometry, LinkedServos, WorldClient
 from sim_backend.world_messages import Camera, Look
 
-#: For the world to answer, s: it compiles before it moves for the first time on a machine.
-_WORLD_PATIENCE = 120.0
+#: For the world to answer, s: it has told its address, so it moves.
+_WORLD_PATIENCE = 10.0
 _TELL_PERIOD = 0.1
 
 
