@@ -734,8 +734,8 @@ async def test_two_silent_servos_are_waited_for_one_at_a_time() -> None:
     assert steps.cycle()  # each was asked by itself: these two are the ones
     before = sum(steps.driver.statistics().errors.values())
     assert all(steps.cycle() for _ in range(5))
-    # A failure counts twice: its kind, and its servo.
-    assert sum(steps.driver.statistics().errors.values()) - before == 2 * 5
+    assert sum(steps.driver.statistics().errors.values()) - before == 5
+    assert set(steps.driver.statistics().blamed) == {"theta_1 (id 1)", "pump (id 4)"}
 
 
 # -- the bus itself -------------------------------------------------------------------------------------------------
