@@ -41,7 +41,9 @@ class BusStatistics(Struct, frozen=True, gc=False):
     histogram: tuple[tuple[float, int], ...]
     """Of the cycles' lengths: lower edge of each bin (s) and its count."""
     errors: dict[str, int]
-    """Failed transactions by kind: no answer, corrupt, refused, adapter lost, and by servo."""
+    """Failed transactions by kind: no answer, corrupt, refused, adapter lost."""
+    blamed: dict[str, int]
+    """Those of them that one servo was asked for, by servo."""
     late: int
     """Answers that came after their time; each was counted as missing."""
     fast: bool
@@ -150,6 +152,7 @@ class Dynamixel:
             self._cycle.summary(),
             self._cycle.histogram(),
             dict(self._watch.errors),
+            dict(self._watch.blamed),
             self._late + (bus.late if (bus := self._bus) is not None else 0),
             self._set_up.fast,
             self._box.counts(self._clock()),

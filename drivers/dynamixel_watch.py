@@ -41,8 +41,9 @@ class Watch:
         self._health_turn = 0
         #: When the servos were last asked, ns.
         self.reading_ns = 0
-        #: Failed transactions, by kind and by servo.
+        #: Failed transactions, by kind, and by servo where one was asked.
         self.errors: Counter[str] = Counter()
+        self.blamed: Counter[str] = Counter()
 
     def read(self, bus: Bus) -> ServoState | None:
         """Ask all that answer; the sample, or None when nobody has told anything. Raises BusError."""
@@ -218,7 +219,7 @@ class Watch:
         self.errors[kinds.get(type(error), "refused")] += 1
         for servo in self._servos:
             if servo.settings.id == error.servo:
-                self.errors[servo.name] += 1
+                self.blamed[servo.name] += 1
                 servo.suspect = True
 
 

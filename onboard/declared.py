@@ -45,13 +45,15 @@ class Declared(NamedTuple):
 
 
 def declared_as(info: mi.Type) -> Declared:
-    """The bare type, and what the metadata around it say; the outermost wins."""
+    """The bare type, and what the metadata around it say; the outermost wins, then those of a union's first kind."""
     extra: dict[str, Any] = {}
     doc = ""
     while isinstance(info, mi.Metadata):
         extra = {**(info.extra or {}), **extra}
         doc = doc or (info.extra_json_schema or {}).get("description", "")
         info = info.type
+    if isinstance(info, mi.UnionType) and not doc:
+        return declared_as(info.types[0])._replace(type=info)
     return Declared(info, extra.get("unit", ""), extra.get("in_flight", False), doc)
 
 
@@ -101,8 +103,9 @@ def _describe(info: mi.StructType, path: Key, instance: Struct | None) -> Iterat
                 yield from _describe(item, (*here, "N"), None)
             case _:
                 leaves = [declared]
-                if isinstance(declared.type, mi.TupleType | mi.VarTupleType):
-                    leaves = [declared.inner(item) for item in _items(declared.type)] or leaves
+                for kind in declared.type.types if isinstance(declared.type, mi.UnionType) else (declared.type,):
+                    if isinstance(kind, mi.TupleType | mi.VarTupleType):
+                        leaves = [declared.inner(item) for item in _items(kind)] or leaves
                 yield Parameter(
                     dotted(here),
                     _type_name(declared.type),

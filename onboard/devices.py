@@ -208,6 +208,7 @@ class FlightDevices(DeviceSet):
             values |= {f"servos.cycle.{name}": value for name, value in _percentiles(bus.cycle).items()}
             values |= {f"servos.period.{name}": value for name, value in _percentiles(bus.period).items()}
             values |= {"servos.rate": bus.samples.rate, "servos.errors": float(sum(bus.errors.values()))}
+            values |= {"servos.late": bus.late}
         if self.world is not None and (look := self.world.latest()) is not None:
             values |= {"world.age": (now - look.t_ns) * 1e-9, "world.slipped": look.slipped}
         return {name: float(value) for name, value in values.items() if isfinite(value)}
