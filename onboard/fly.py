@@ -189,7 +189,9 @@ class _Flight:
         for code, trouble in (("log", self._recorder.trouble()), ("systemd", self._notifier.trouble())):
             if trouble:
                 self._tell(Event(now, code, Severity.ERROR, trouble))
-        if not self._ready and outputs.phase is Phase.PREFLIGHT and _passes(outputs):
+        if outputs.phase is not Phase.PREFLIGHT:
+            self._ready = False
+        elif not self._ready and _passes(outputs):
             self._ready = True
             self._say("ready to fly: preflight passes")
         self._notifier.status(outputs.phase.value)

@@ -219,8 +219,7 @@ def _kick(x: Array, p: Array, u: Array) -> None:
                 (vx + xx * ux + xy * uy + xz * uz, vy + yx * ux + yy * uy + yz * uz, vz + zx * ux + zy * uy + zz * uz),
             )
             if gz > 0.0:
-                if i < 4:
-                    x[at.ON_GROUND] = 1.0
+                x[at.ON_GROUND] = 1.0
                 ex = xx * gx + yx * gy + zx * gz
                 ey = xy * gx + yy * gy + zy * gz
                 ez = xz * gx + yz * gy + zz * gz

@@ -46,6 +46,7 @@ class WorldServer:
         self._on_phase = on_phase
         self._mocks = (MockAutopilot(world, clock), MockOdometry(world, clock), MockServos(world, clock))
         self._peers: dict[Address, tuple[Hello, float]] = {}
+        self._phase = ""
         self._socket = socket(AF_INET, SOCK_DGRAM)
         try:
             self._socket.bind(bind)
@@ -82,6 +83,7 @@ class WorldServer:
             if isinstance(message, Hello):
                 self._peers[address] = (message, now)
                 if message.phase:
+                    self._phase = message.phase
                     for enter in self._on_phase:
                         enter(message.phase, self._world.time)
             else:
@@ -105,6 +107,7 @@ class WorldServer:
             snapshot.torque_on,
             dict(self._received()),
             self._slipped(),
+            self._phase,
         )
         packets: dict[tuple[str, ...], bytes] = {}
         for peer, (hello, _) in self._peers.items():

@@ -42,6 +42,8 @@ class Look(Struct, frozen=True, tag=True, gc=False):
     """Messages that the emulated autopilot has taken so far, by name."""
     slipped: float
     """Seconds that the world could not keep pace with the wall clock."""
+    phase: str = ""
+    """Of the mission, as the process that flies has told it last; empty: nobody flies yet."""
     autopilot: AutopilotState | None = None
     odometry: Odometry | None = None
     servos: ServoState | None = None

@@ -11,9 +11,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Condition
 from types import TracebackType
+from typing import NamedTuple
 
 from groundstation.desk import Desk, end, start
+from onboard.core.types import Phase
 from sim_backend.world_client import WorldClient
 from sim_backend.world_messages import Look
 from tests.realtime import alone
@@ -57,6 +60,13 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+class Line(NamedTuple):
+    """What the flight process has said on standard error, and when it was heard, ns on the monotonic clock."""
+
+    t_ns: int
+    text: str
+
+
 class Flying:
     """World and flight process of one configuration. Use as a context manager."""
 
@@ -64,12 +74,15 @@ class Flying:
         self.folder = folder
         self._common = [f"--config={config}", *(f"--set={item}" for item in (*BRISK, *sets))]
         self.looks: list[Look] = []
-        self._said: list[str] = []
+        self.lines: list[Line] = []
+        self._ended = False
+        #: Notified by every look and every line.
+        self._news = Condition()
 
     def __enter__(self) -> Flying:
         self._desk = Desk(self._common)
         self.endpoints = self._desk.start_world()
-        self.client = WorldClient(self.endpoints["devices.world"], on_look=self.looks.append)
+        self.client = WorldClient(self.endpoints["devices.world"], on_look=self._see)
         self.client.start(PATIENCE)
         sets = [f"--set={path}={value}" for path, value in self.endpoints.items()]
         out = ["--out", str(self.folder), "--no-progress"]
@@ -89,12 +102,22 @@ class Flying:
         self.client.stop()
         self._desk.__exit__(None, None, None)
         if error is not None:
-            error.add_note("the flight process said:\n" + "\n".join(self._said))
+            error.add_note("the flight process said:\n" + "\n".join(line.text for line in self.lines))
 
     def _listen(self) -> None:
         assert self.flight.stderr is not None
-        for line in self.flight.stderr:
-            self._said.append(line.rstrip())
+        for text in self.flight.stderr:
+            with self._news:
+                self.lines.append(Line(time.monotonic_ns(), text.rstrip()))
+                self._news.notify_all()
+        with self._news:
+            self._ended = True
+            self._news.notify_all()
+
+    def _see(self, look: Look) -> None:
+        with self._news:
+            self.looks.append(look)
+            self._news.notify_all()
 
     # -- what may be done -----------------------------------------------------------------------------------------
 
@@ -131,9 +154,9 @@ class Flying:
         self.wait(f"no more {message}", is_silent)
         return last
 
-    def said(self, words: str) -> list[str]:
-        """What the flight process has said on standard error with these words in it."""
-        return [line for line in self._said if words in line]
+    def said(self, words: str, since: int = 0) -> list[str]:
+        """What the flight process has said with these words in it, since that time (ns, monotonic)."""
+        return [line.text for line in self.lines if line.t_ns >= since and words in line.text]
 
     def wait(
         self, what: str, happens: Callable[[Look], bool], patience: float = PATIENCE, since: Look | None = None
@@ -142,30 +165,65 @@ class Flying:
         seen = len(self.looks) - 1
         while since is not None and self.looks[seen].t_ns > since.t_ns:
             seen -= 1
-        until = time.monotonic() + patience
-        while time.monotonic() < until:
+
+        def found() -> Look | None:
+            nonlocal seen
             while seen < len(self.looks):
                 if happens(self.looks[seen]):
                     return self.looks[seen]
                 seen += 1
-            time.sleep(0.01)
-        truth = self.look().truth
-        raise AssertionError(f"not within {patience:g} s: {what}; the vehicle is at {truth.p_WB}")
+            return None
 
-    def wait_said(self, words: str, patience: float = PATIENCE) -> str:
-        """The first sentence of the flight process with these words in it."""
-        until = time.monotonic() + patience
-        while time.monotonic() < until:
-            if lines := self.said(words):
-                return lines[0]
-            time.sleep(0.01)
-        raise AssertionError(f"not said within {patience:g} s: {words}")
+        with self._news:
+            look = self._news.wait_for(found, patience)
+        if look is None:
+            last = self.look()
+            raise AssertionError(
+                f"not within {patience:g} s: {what}; the vehicle is at {last.truth.p_WB}, phase {last.phase}, "
+                f"mode {last.mode}, {'armed' if last.armed else 'disarmed'}"
+            )
+        return look
+
+    def wait_said(self, words: str, patience: float = PATIENCE, since: int = 0) -> str:
+        """The first sentence of the flight process with these words in it, since that time (ns, monotonic)."""
+        with self._news:
+            self._news.wait_for(lambda: self._ended or self.said(words, since), patience)
+            said = self.said(words, since)
+        if not said:
+            raise AssertionError(f"not said {f'within {patience:g} s' if not self._ended else 'to its end'}: {words}")
+        return said[0]
+
+    def rest(self, seconds: float) -> Look:
+        """Let the world go on for so long."""
+        until = self.look().t_ns + round(seconds * 1e9)
+        return self.wait(f"the next {seconds:g} s", lambda look: look.t_ns >= until)
 
     def take_off(self) -> Look:
         """Up to the hover."""
         self.wait_said("ready")
         self.ask("takeoff")
         return self.wait("hover", lambda look: look.truth.p_WB[2] > 0.75)
+
+    def hover(self) -> Look:
+        """Up to the hover, from the first preflight or after a ``reset``; the takeoff is over."""
+        self.take_off()
+        return self.wait("hold", lambda look: look.phase == Phase.HOLD)
+
+    def land(self) -> Look:
+        """Down by request."""
+        self.ask("land")
+        return self.stopped()
+
+    def stopped(self, patience: float = PATIENCE) -> Look:
+        """On the ground, motors off, nothing broken, and the mission knows it."""
+        self.ended_safely(patience)
+        return self.wait("stopped", lambda look: look.phase == Phase.STOPPED, patience)
+
+    def reset(self) -> None:
+        """Back to preflight, and ready for the next flight."""
+        now = time.monotonic_ns()
+        self.ask("reset")
+        self.wait_said("ready", since=now)
 
     def press(self) -> Look:
         """The whole way to a steady press."""
