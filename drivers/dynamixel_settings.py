@@ -44,9 +44,10 @@ class DynamixelSettings(Struct, frozen=True, forbid_unknown_fields=True):
         ServoSettings(4),
         ServoSettings(5),
     )
-    baud: Annotated[int, _meta("bit/s", "57600, 115200 or 1 to 4 million, as set in the servos", 9600, 4_000_000)] = (
-        1_000_000
-    )
+    baud: Annotated[
+        Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000],
+        Meta(description="as set in the servos", extra={"unit": "bit/s", "in_flight": False}),
+    ] = 1_000_000
     period: Annotated[float, _meta("s", "between cycles while nothing is commanded", 0.001, 0.1)] = 0.004
     patience: Annotated[float, _meta("s", "without a command the bus is left silent after this", 0.005, 1.0)] = 0.030
     watchdog: Annotated[float, _meta("s", "silence that makes the servos stop; steps of 0.02", 0.02, 2.54)] = 0.10

@@ -100,7 +100,7 @@ class WorldProcess:
         except BaseException as error:
             self.close()
             if isinstance(error, ValueError):
-                raise ConfigError([f"faults: {error}"]) from error
+                raise ConfigError([str(error)]) from error
             raise
 
     def inject(self, fault: Fault) -> None:

@@ -121,7 +121,7 @@ async def rig(request: pytest.FixtureRequest) -> AsyncIterator[Rig]:
             stays_put(request, "; set PIPEWRIGHT_MAY_MOVE=1 to allow it")
         # Half of what they can, in a test.
         gentle = [ServoSettings(id=each.id, current_limit=0.8) for each in DynamixelSettings("").servos]
-        given = DynamixelSettings(port, msgspec.convert(gentle, FiveServos), int(baud or 1_000_000))
+        given = DynamixelSettings(port, msgspec.convert(gentle, FiveServos), int(baud or 1_000_000))  # type: ignore[arg-type]
         real = Dynamixel(given)
         async with running(real):
             yield RealRig(real, None)

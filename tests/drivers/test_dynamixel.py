@@ -262,7 +262,7 @@ async def test_settings_that_cannot_be() -> None:
     with pytest.raises(DeviceError, match="not all different"):
         Dynamixel(DynamixelSettings("x", (*MOUNTING[:4], MOUNTING[0])))
     with pytest.raises(DeviceError, match="baud 250000; want one of"):
-        Dynamixel(DynamixelSettings("x", baud=250_000))
+        Dynamixel(DynamixelSettings("x", baud=250_000))  # type: ignore[arg-type]
     with pytest.raises(msgspec.ValidationError, match=r"sign"):
         msgspec.convert({"id": 1, "sign": 2}, ServoSettings)
 
