@@ -152,6 +152,15 @@ class _ParamValue(Struct, gc=False):
     """None: not finite, as the bits of some whole numbers are."""
 
 
+class _Text(Struct, frozen=True, gc=False):
+    """A status text, as far as it has come."""
+
+    t_ns: int
+    number: int
+    severity: int
+    text: str
+
+
 class _Attitude(Struct, frozen=True, gc=False):
     t_ns: int
     q_WB: Quat
@@ -200,7 +209,7 @@ _PREARM = 0x1000_0000  # MAV_SYS_STATUS_PREARM_CHECK
 _FORCE = 21196.0  # the number that makes PX4 disarm in the air
 _UNUSED_CELL = 65535
 _TEXT_CHUNK = 50
-_MAX_CHUNKED_TEXTS = 16
+_WARNING = 4  # MAV_SEVERITY
 _IGNORE_BODY_RATES, _IGNORE_ATTITUDE = 7, 128  # ATTITUDE_TARGET_TYPEMASK
 _LOCAL_FRD, _BODY_FRD, _VIO = 20, 12, 3  # MAV_FRAME, MAV_FRAME, MAV_ESTIMATOR_TYPE
 
@@ -232,6 +241,10 @@ _SLOW_STREAMS = (
 _PERIOD = 0.05  # of the driver's own task, s
 _ASK_AGAIN_NS = 1_000_000_000
 _FRESH_NS = 200_000_000
+_HEARTBEAT_NS = 1_000_000_000
+_TEXT_NS = 500_000_000
+#: MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, MAV_STATE_ACTIVE.
+_GROUND_STATION = '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
 _RATE_CHECK_NS = 3_000_000_000
 _RATE_TOLERANCE = 0.8
 _REBOOT_MS = 1000  # PX4's time does not go back further than packets can overtake each other
@@ -276,7 +289,7 @@ class Px4:
             "BATTERY_STATUS": self._battery,
             "SYS_STATUS": self._health,
         }
-        self._texts: dict[int, str] = {}
+        self._text: _Text | None = None
 
         self._hub: Any = None
         self._param: Any = None
@@ -285,6 +298,7 @@ class Px4:
         self._asking: set[asyncio.Task[None]] = set()
         self._tuning: asyncio.Task[None] | None = None
         self._linked = True
+        self._heard_ns = -(10**18)
         self._boot_ms = 0
         self._intervals_due = False
         self._slow: set[str] = set()
@@ -382,6 +396,7 @@ class Px4:
         self._subscribe("STATUSTEXT", _StatusText, self._on_text)
         self._subscribe("TIMESYNC", _Timesync, self._on_timesync)
         self._subscribe("PARAM_VALUE", _ParamValue, self._on_parameter)
+        self._keep_texts_coming()
         await self._ask_intervals()
         await self._wait_for_samples()
         await self._compare_parameters()
@@ -577,6 +592,7 @@ class Px4:
         while True:
             await asyncio.sleep(_PERIOD)
             self._send("COMMAND_LONG", _command_json(_HEARTBEAT))
+            self._keep_texts_coming()
             self._judge_rates()
             if self._wanted is Engage.KILL:
                 self._work_towards_kill()
@@ -588,6 +604,16 @@ class Px4:
             if self._parameters_due and self._linked and (self._comparing is None or self._comparing.done()):
                 self._parameters_due = False
                 self._comparing = self._begin(self._compare_parameters())
+
+    def _keep_texts_coming(self) -> None:
+        """PX4 tells status texts only where it hears a ground station. The end of one may be lost: it is let go."""
+        now = self._clock()
+        if now - self._heard_ns >= _HEARTBEAT_NS:
+            self._heard_ns = now
+            self._send("HEARTBEAT", _GROUND_STATION)
+        text = self._text
+        if text is not None and now - text.t_ns > _TEXT_NS:
+            self._end_text()
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Do it beside everything else: an answer that is late must not keep the next question back."""
@@ -762,17 +788,24 @@ class Px4:
         self._health.put(bool(m.onboard_control_sensors_health & _PREARM), now)
 
     def _on_text(self, m: _StatusText, now: int) -> None:
-        text = m.text.rstrip("\0")
-        if m.id:
-            # A long text comes in pieces; the one that is not full ends it. A lost end must not pile up.
-            text = (self._texts.pop(m.id, "") if m.chunk_seq else "") + text
-            if len(m.text.rstrip("\0")) == _TEXT_CHUNK:
-                self._texts[m.id] = text
-                if len(self._texts) > _MAX_CHUNKED_TEXTS:
-                    self._texts.pop(next(iter(self._texts)))
-                return
-        level = Level.ERROR if m.severity <= 3 else Level.WARNING if m.severity == 4 else Level.INFO  # MAV_SEVERITY
-        self._told.tell(now, level, f"PX4: {text}")
+        # A long text comes in pieces of one number. The last is not full, or nothing more comes: there is no empty end.
+        piece = m.text.rstrip("\0")
+        begun = self._text
+        if begun is not None and begun.number == m.id and m.chunk_seq:
+            self._text = _Text(now, m.id, m.severity, begun.text + piece)
+        else:
+            self._end_text()
+            self._text = _Text(now, m.id, m.severity, piece)
+        if len(piece) < _TEXT_CHUNK:
+            self._end_text()
+
+    def _end_text(self) -> None:
+        """Tell the text that has come so far."""
+        text, self._text = self._text, None
+        if text is not None:
+            worse = text.severity < _WARNING
+            level = Level.ERROR if worse else Level.WARNING if text.severity == _WARNING else Level.INFO
+            self._told.tell(text.t_ns, level, f"PX4: {text.text.rstrip()}")
 
     def _on_timesync(self, m: _Timesync, now: int) -> None:
         # PX4 asks for the time here, and so learns to read the times of the poses.

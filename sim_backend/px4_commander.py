@@ -3,8 +3,10 @@
 The rules are those of PX4's main branch of May 2025, towards v1.16 (modules commander and land_detector), for a
 multicopter without a pilot's sticks and without satellites, as far as an offboard flight meets them:
 
-- Disarmed, any mode may be chosen; armed, only one that can run. Hold wants a local and a global position, the latter
-  not to be had from vision alone; Land wants a local position; offboard attitude wants nothing but its signal.
+- Disarmed, any mode may be chosen; armed, only one that can run, and Land always. Hold wants a local and a global
+  position, the latter not to be had from vision alone; Land wants a local position; offboard attitude wants nothing but
+  its signal. After disarming, the mode is again the one chosen last in which one may arm.
+- Why a mode cannot run, PX4 tells in events only; in status texts it says no more than that arming is denied.
 - What cannot run falls back: Hold, Return (wants home), Land, Descend (level, down at MPC_LAND_SPEED), termination.
 - While disarmed, PX4's land detector says landed. In offboard attitude it takes thrust under MPC_MANTHR_MIN and a
   hundredth, without motion, for a landing; so any thrust above is a takeoff. In PX4's own modes its velocity controller
@@ -54,12 +56,7 @@ _CONTROL_LOSS = {1: Action.HOLD, 2: Action.RETURN, 3: Action.LAND, 5: Action.TER
 _STAGE = 1.0 / 3.0  # s that each of ground contact, maybe landed and landed lasts before it is believed
 _UNWINDING = 2.0  # s until PX4's velocity controller has taken the thrust away from a vehicle that does not sink
 _LOW, _CRITICAL, _EMERGENCY = 1, 2, 3
-_BATTERY = {
-    _LOW: (Severity.WARNING, "Low battery level, return advised"),
-    _CRITICAL: (Severity.CRITICAL, "Critical battery level, land now"),
-    _EMERGENCY: (Severity.EMERGENCY, "Emergency battery level, land immediately"),
-}
-_NAMES = {FlightMode.OFFBOARD: "Offboard", FlightMode.HOLD: "Hold", FlightMode.LAND: "Land"}
+_BATTERY = {_LOW: "Low battery", _CRITICAL: "Critical battery", _EMERGENCY: "Emergency battery level"}
 
 
 class _Held:
@@ -106,6 +103,7 @@ class Commander(Autopilot):
         #: A failsafe has taken over.
         self.failsafe = False
         self._blind = False
+        self._after_disarming = FlightMode.HOLD
         self._now = 0.0
         self._contact, self._maybe, self._down = _Held(True), _Held(True), _Held(True)
         self._unwound = _Held(False, _UNWINDING)
@@ -124,48 +122,34 @@ class Commander(Autopilot):
 
     def can_run(self, mode: FlightMode, t: float) -> bool:
         """The mode has what it needs."""
-        return not self._lacking(mode, t)
-
-    def _lacking(self, mode: FlightMode, t: float) -> list[str]:
-        """What the mode needs and does not have, in PX4's words."""
         if mode is FlightMode.OFFBOARD:
-            return [] if self.streaming(t) else ["No offboard signal"]
-        lacking = []
-        if not self._estimator.horizontal_valid(t):
-            lacking.append("Navigation error: No valid position estimate")
-        if mode is FlightMode.HOLD and not self.global_origin:
-            lacking.append("Navigation error: No valid global position estimate")
-        return lacking
+            return self.streaming(t)
+        located = self._estimator.horizontal_valid(t)
+        return located and (self.global_origin or mode is not FlightMode.HOLD)
 
-    def failures(self, t: float) -> list[str]:
-        """Why it would not arm in the present mode, in PX4's words."""
-        if self.terminated:
-            return ["Flight termination active"]
-        failures = self._lacking(self.mode, t)
-        if self.mode is FlightMode.LAND:
-            failures = ["Mode not suitable for arming", *failures]
-        if self._charge <= self._parameter("BAT_CRIT_THR"):
-            failures.append("Low battery level")
-        return failures
+    def can_arm(self, t: float) -> bool:
+        """The pre-arm checks of the present mode pass."""
+        charged = self._charge > self._parameter("BAT_CRIT_THR")
+        may_arm = self.mode is not FlightMode.LAND and not self.terminated
+        return charged and may_arm and self.can_run(self.mode, t)
 
     def switch(self, mode: FlightMode, t: float) -> bool:
-        """Change the mode, as the pilot's or the computer's command; refused in words."""
-        if self.terminated or mode is FlightMode.OTHER or (self.armed and not self.can_run(mode, t)):
-            name = _NAMES.get(mode, "this mode")
-            self._say(Severity.CRITICAL, f"Switching to {name} is currently not available")
+        """Change the mode, as the pilot's or the computer's command; False when it cannot be."""
+        allowed = not self.armed or mode is FlightMode.LAND or self.can_run(mode, t)
+        if self.terminated or mode is FlightMode.OTHER or not allowed:
             return False
         self.mode = mode
-        self.failsafe = False
+        self.failsafe = self._blind = False
+        if mode is not FlightMode.LAND:
+            self._after_disarming = mode
         return True
 
     def try_arm(self, t: float, force: bool) -> bool:
         """Arm on command; refused in words. Without checks if forced, but never after a termination."""
         if self.armed:
             return True
-        failures = self.failures(t)
-        if failures and (self.terminated or not force):
-            for failure in failures:
-                self._say(Severity.CRITICAL, f"Preflight Fail: {failure}")
+        if self.terminated or not (force or self.can_arm(t)):
+            self._watch_battery()
             self._say(Severity.CRITICAL, "Arming denied: Resolve system health failures first")
             return False
         self.killed = False
@@ -191,10 +175,11 @@ class Commander(Autopilot):
         if not self.terminated:
             self.terminated = self.failsafe = True
             self._stop()
-            self._say(Severity.EMERGENCY, "Flight termination active")
+            self._say(Severity.CRITICAL, "Failsafe activated")
 
     def _disarm(self, reason: str) -> None:
         self._stop()
+        self.mode = self._after_disarming
         self.failsafe = False
         self._say(Severity.INFO, f"Disarmed by {reason}")
 
@@ -203,21 +188,24 @@ class Commander(Autopilot):
     def _fail_safe(self, t: float) -> None:
         if not self.armed:
             return
-        self._watch_battery()
+        worse = self._watch_battery()
+        # 2: Land at critical; 3: Return at critical, which is Land without a home
+        if worse >= _CRITICAL and self._parameter("COM_LOW_BAT_ACT") >= 2 and worse > self._warned_at_arming:
+            self._take(Action.LAND, t)
         if self.mode is FlightMode.OFFBOARD and not self.streaming(t):
             action = _OFFBOARD_LOSS.get(int(self._parameter("COM_OBL_RC_ACT")))
             if action is None:
                 action = _CONTROL_LOSS.get(int(self._parameter("NAV_RCL_ACT")), Action.RETURN)
-            self._take(action, t, "No offboard signal")
+            self._take(action, t)
         elif self.mode is FlightMode.HOLD and self._down.state is False and not self.can_run(FlightMode.HOLD, t):
-            self._take(Action.RETURN, t, "No valid position estimate")
+            self._take(Action.RETURN, t)
         elif self.mode is FlightMode.LAND:
             blind = not self.can_run(FlightMode.LAND, t)
             if blind and not self._blind:
-                self._take(Action.DESCEND, t, "No valid position estimate")
+                self._take(Action.DESCEND, t)
             self._blind = blind
 
-    def _take(self, action: Action, t: float, cause: str) -> None:
+    def _take(self, action: Action, t: float) -> None:
         """Enter a failsafe: the wanted action, or what it falls back to."""
         if action is Action.HOLD and not self.can_run(FlightMode.HOLD, t):
             action = Action.RETURN
@@ -234,20 +222,17 @@ class Commander(Autopilot):
             return
         self.mode = FlightMode.HOLD if action is Action.HOLD else FlightMode.LAND
         self._blind = action is Action.DESCEND
-        what = "Autopilot disengaged, switching" if self._blind else "switching"
-        self._say(Severity.CRITICAL, f"Failsafe activated: {what} to {action.name.title()} ({cause})")
+        self._say(Severity.CRITICAL, "Failsafe activated")
 
-    def _watch_battery(self) -> None:
-        """Tell each worse level once, and act on it as COM_LOW_BAT_ACT says."""
+    def _watch_battery(self) -> int:
+        """Tell each worse level of the battery once; the level if it is news, else 0."""
         thresholds = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
         level = sum(self._charge <= self._parameter(name) for name in thresholds)
         if level <= self._warned:
-            return
+            return 0
         self._warned = level
-        self._say(*_BATTERY[level])
-        acts_at = {2: _CRITICAL, 3: _CRITICAL}.get(int(self._parameter("COM_LOW_BAT_ACT")))
-        if acts_at is not None and level >= acts_at and level > self._warned_at_arming:
-            self._take(Action.LAND, self._now, "Battery level")
+        self._say(Severity.EMERGENCY, _BATTERY[level])
+        return level
 
     def _disarm_landed(self, t: float) -> None:
         if not self.armed:

@@ -18,7 +18,7 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from math import isfinite, nan
+from math import inf, isfinite, nan
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -53,6 +53,7 @@ KINDS = (
 )  # fmt: skip
 _SYSTEM, _AUTOPILOT = 1, 1
 _TEXT_CHUNK = 50
+_GROUND_STATION_LOST = 2.5  # s
 _FORCE = 21196.0
 _ACCEPTED, _REJECTED, _DENIED, _UNSUPPORTED, _FAILED = 0, 1, 2, 3, 4  # MAV_RESULT
 _MODE_OF = {numbers: mode for mode, numbers in MODES.items()}
@@ -89,7 +90,6 @@ class Px4StandIn:
         self.newest: dict[str, Any] = {}
         self._face = MockAutopilot(world)
         self._link = Link(bind, peer, _SYSTEM, _AUTOPILOT, self.faults, seed)
-        self._text_id = 0
         self._rebooting = False
         self._handlers: dict[str, Callable[[Any], None]] = {
             "SET_ATTITUDE_TARGET": self._on_set_attitude_target,
@@ -99,6 +99,7 @@ class Px4StandIn:
             "PARAM_REQUEST_LIST": self._on_param_list,
             "PARAM_REQUEST_READ": self._on_param_read,
             "PARAM_SET": self._on_param_set,
+            "HEARTBEAT": self._on_heartbeat,
             "TIMESYNC": self._on_timesync,
             "PING": self._on_ping,
             "ODOMETRY": self._on_odometry,
@@ -116,6 +117,8 @@ class Px4StandIn:
         self.streams = Streams(world, self.commander, self.estimator, self.faults, world.snapshot.t_ns)
         #: World time less the time of the peer that tells poses, ns, and the round trip that it was measured on.
         self._peer_clock: tuple[int, int] | None = None
+        self._ground_station_s = -inf
+        self._text_id = 0
         self._link.forget()
 
     def _parameter(self, name: str) -> float:
@@ -339,16 +342,23 @@ class Px4StandIn:
             target = (m.get_srcSystem(), m.get_srcComponent())
             self._link.send(mavlink.MAVLink_ping_message(m.time_usec, m.seq, *target))
 
+    def _on_heartbeat(self, m: Any) -> None:
+        if m.type == mavlink.MAV_TYPE_GCS:
+            self._ground_station_s = self.world.time
+
     def _say(self, severity: Severity, text: str) -> None:
-        data = text.encode()
-        if len(data) < _TEXT_CHUNK:
-            self._link.send(mavlink.MAVLink_statustext_message(severity, data))
+        """A status text, in PX4's way: none before a ground station's heartbeat has come, and each with a number.
+
+        PX4 puts a tab behind a text that it tells as an event too, which is nearly all of them. A long text comes in
+        pieces, and no empty one follows where the last of them is full.
+        """
+        if self.world.time - self._ground_station_s > _GROUND_STATION_LOST:
             return
-        self._text_id = self._text_id % 0xFFFF + 1
-        # A full last piece is followed by an empty one, so that the end is always seen.
-        for chunk in range(len(data) // _TEXT_CHUNK + 1):
+        data = text.encode() + b"\t"
+        for chunk in range(-(-len(data) // _TEXT_CHUNK)):
             piece = data[chunk * _TEXT_CHUNK : (chunk + 1) * _TEXT_CHUNK]
             self._link.send(mavlink.MAVLink_statustext_message(severity, piece, self._text_id, chunk))
+        self._text_id = (self._text_id + 1) % 0x10000
 
 
 def _whole(value: float) -> int:

@@ -167,7 +167,7 @@ class Streams:
 
     def _sys_status(self) -> Any:
         t, healthy = self._world.time, _SENSORS
-        if not self._commander.failures(t):
+        if self._commander.can_arm(t):
             healthy |= mavlink.MAV_SYS_STATUS_PREARM_CHECK  # which PX4 tells among the healthy only
         if not self._estimator.horizontal_valid(t):
             healthy &= ~mavlink.MAV_SYS_STATUS_SENSOR_VISION_POSITION

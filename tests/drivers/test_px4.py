@@ -304,6 +304,7 @@ async def test_offboard_is_not_taken_back_from_a_pilot(pair: tuple[Px4, Px4Stand
         px4.command(command())
 
     await until(lambda: state() == (True, FlightMode.OFFBOARD), tick)
+    stand_in.parameters.set("COM_DISARM_LAND", 5.0)
     commander.mode = FlightMode.LAND  # the pilot's switch
     await until(lambda: state()[1] is FlightMode.LAND, tick)
     sent = px4.sent()
@@ -317,14 +318,18 @@ async def test_offboard_is_not_taken_back_from_a_pilot(pair: tuple[Px4, Px4Stand
 
 async def test_a_refusal_is_told_with_px4s_reason(pair: tuple[Px4, Px4StandIn]) -> None:
     px4, stand_in = pair
-    stand_in.world.plant.x[at.CHARGE] = 0.05
+    stand_in.world.plant.x[at.CHARGE] = 0.06
     told: list[str] = []
 
     def tick() -> None:
         px4.command(command())
         told.extend(n.text for n in px4.notices())
 
-    want = {"autopilot: arming: temporarily rejected", "PX4: Preflight Fail: Low battery level"}
+    want = {
+        "autopilot: arming: temporarily rejected",
+        "PX4: Arming denied: Resolve system health failures first",
+        "PX4: Critical battery",
+    }
     await until(lambda: want <= set(told), tick)
 
 
@@ -390,11 +395,20 @@ async def test_a_number_that_is_not_finite_is_rejected(pair: tuple[Px4, Px4Stand
 
 async def test_long_status_texts_are_joined(pair: tuple[Px4, Px4StandIn]) -> None:
     px4, stand_in = pair
-    text = "".join(chr(97 + i % 26) for i in range(130))
-    stand_in._say(Severity.WARNING, text)
+    await until(lambda: stand_in.received["HEARTBEAT"] > 0)
+    texts = ["".join(chr(97 + i % 26) for i in range(length)) for length in (130, 49, 99, 50, 20)]
+    for text in texts:  # with the tab that PX4 adds, the second and third end in a full piece
+        stand_in._say(Severity.WARNING, text)
     told: list[tuple[Level, str]] = []
-    await until(lambda: bool(told), lambda: told.extend((n.level, n.text) for n in px4.notices() if "abc" in n.text))
-    assert told == [(Level.WARNING, f"PX4: {text}")]
+    await until(
+        lambda: len(told) == 5, lambda: told.extend((n.level, n.text) for n in px4.notices() if "abc" in n.text)
+    )
+    assert told == [(Level.WARNING, f"PX4: {text}") for text in texts]
+    stand_in._say(Severity.ERROR, texts[1])  # and nothing after it
+    await until(
+        lambda: told[-1] == (Level.ERROR, f"PX4: {texts[1]}"),
+        lambda: told.extend((n.level, n.text) for n in px4.notices() if "abc" in n.text),
+    )
 
 
 async def test_a_rate_that_has_fallen_is_told_once_and_asked_for_again(pair: tuple[Px4, Px4StandIn]) -> None:

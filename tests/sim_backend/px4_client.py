@@ -28,6 +28,7 @@ class Client:
     """
 
     sees = False
+    beats = True
     shift: Vec3 = (0.0, 0.0, 0.0)
     quality = 100
     counter = 0
@@ -43,15 +44,21 @@ class Client:
         self.mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
         self.parser = mavlink.MAVLink(None)
         self.seen: list[Any] = []
-        self.send(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+        self.beat()
 
     def send(self, message: Any) -> None:
         self.socket.sendto(message.pack(self.mav), ("127.0.0.1", self.stand_in.port))
+
+    def beat(self) -> None:
+        """Without a ground station's heartbeat PX4 tells no status texts."""
+        self.send(mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3))
 
     def run(self, seconds: float, thrust: float | None = None, mask: int = LEVEL_RATES) -> list[Any]:
         """Step the stand-in, with a set-point before each step if a thrust is given; what it said meanwhile."""
         seen: list[Any] = []
         for k in range(round(seconds / self.stand_in.period)):
+            if self.beats and k % 50 == 0:
+                self.beat()
             if self.sees and k % 5 == 0:
                 self.tell_pose()
             if thrust is not None:
@@ -85,6 +92,8 @@ class Client:
                 data = self.socket.recv(4096)
             except BlockingIOError:
                 return messages
+            except ConnectionRefusedError:  # nobody is there
+                continue
             messages += self.parser.parse_buffer(data) or []
 
     def command(self, command: int, *params: float) -> int:
@@ -109,11 +118,11 @@ class Client:
         """Status texts so far, those in pieces joined."""
         joined: list[str] = []
         for m in of(self.seen, "STATUSTEXT"):
-            if m.id and m.chunk_seq:
+            if m.chunk_seq:
                 joined[-1] += m.text
             else:
                 joined.append(m.text)
-        return joined
+        return [text.rstrip() for text in joined]
 
     def told(self) -> str:
         return "\n".join(self.texts())
