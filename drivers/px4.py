@@ -3,7 +3,7 @@
 Set-points leave as raw SET_ATTITUDE_TARGET messages, one for each call of ``command``. MAVSDK's offboard plugin is not
 used, because it repeats the last set-point by itself, so that a hung process would never trip PX4's offboard-loss
 failsafe. Telemetry comes through MAVSDK's own thread straight into mailboxes: its asyncio streams queue without bound
-and cost twice as much. (docs/decisions/px4-wire.md)
+and cost twice as much. (docs/decisions/0005-px4-wire.md)
 """
 
 from __future__ import annotations
