@@ -56,6 +56,15 @@ class DeviceConfig(Struct, frozen=True, forbid_unknown_fields=True):
     odometry: OdometryConfig = OdometryConfig()
     servos: ServosConfig = ServosConfig()
     hitl: Annotated[bool, _note("a real autopilot may arm although other devices are not real")] = False
+    agreement: Annotated[
+        float,
+        Meta(
+            ge=0.05,
+            le=10.0,
+            description="PX4's position estimate may be so far from the tracker's",
+            extra={"unit": "m", "in_flight": False},
+        ),
+    ] = 0.3
     world: Annotated[str, _note("host:port of the process that holds the world; empty: none is needed")] = ""
     simulator: Annotated[
         str,

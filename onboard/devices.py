@@ -19,6 +19,7 @@ from drivers.samples import Interface
 from drivers.spread import Summary
 from drivers.t265 import T265
 from drivers.thrust import ThrustMap
+from onboard.agreement import Agreement
 from onboard.config import CONFIGS, Config
 from onboard.device_config import Kind
 from onboard.layers import ConfigError
@@ -112,6 +113,8 @@ class FlightDevices(DeviceSet):
             "autopilot": self.autopilot, "odometry": self.odometry, "servos": self.servos
         }  # fmt: skip
         self._mixed = _mixed(kinds, devices.hitl)
+        self._agreement = Agreement(devices.agreement)
+        self._told: list[tuple[str, Notice]] = []
 
     def _autopilot_of(self, config: Config) -> AutopilotDevice:
         settings = config.devices.autopilot
@@ -176,22 +179,28 @@ class FlightDevices(DeviceSet):
     # -- in every tick --------------------------------------------------------------------------------------------
 
     def relay(self) -> None:
-        """Hand the newest pose to PX4's own estimator."""
+        """Hand the newest pose to PX4's own estimator, and see whether that follows it."""
         if self._px4 is not None and self._tracker is not None:
             pose = self._tracker.latest()
             if pose is not None:
                 self._px4.odometry(pose, *self._tracker.trust(pose.confidence))
+                notice = self._agreement.judge(monotonic_ns(), self._px4.vision_disagreement(pose))
+                if notice is not None:
+                    self._told.append(("autopilot", notice))
 
     def obstacles(self) -> tuple[str, ...]:
         """Why the vehicle must not arm."""
+        apart = self._agreement.obstacle
         differences = () if self._px4 is None else self._px4.parameter_differences()
-        if not differences:
+        if not differences and not apart:
             return self._mixed
-        return (*self._mixed, f"PX4's parameters are not those of the vehicle: {'; '.join(differences)}.")
+        found = [f"PX4's parameters are not those of the vehicle: {'; '.join(differences)}."] if differences else []
+        return (*self._mixed, *found, *([apart] if apart else []))
 
     def notices(self) -> list[tuple[str, Notice]]:
         """What the drivers have had to tell since the last call, each with the name of its device."""
-        told = [(name, notice) for name, device in self._named.items() for notice in device.notices()]
+        told, self._told = self._told, []
+        told += [(name, notice) for name, device in self._named.items() for notice in device.notices()]
         return sorted(told, key=lambda item: item[1].t_ns)
 
     def statistics(self) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The mission in real time: the PX4 driver over MAVLink to the stand-in, vision and servos mock.
+"""The mission in real time: all three real drivers over real bytes to their emulators, in two processes.
 
 Bounds are wide on purpose: they tell a loop that keeps up from one that does not, on a busy machine too.
 """
@@ -15,6 +15,9 @@ import pytest
 
 from onboard.replay import replay
 from tests.acceptance.flights import Flown, completed, look, pipewright
+from tests.realtime import LONGEST, alone
+
+pytestmark = pytest.mark.timeout(LONGEST)
 
 #: About 65 s of flight: a near pipe, brisk motion, a light and short press.
 BRISK = (
@@ -45,7 +48,7 @@ BRISK = (
 @pytest.fixture(scope="module")
 def folder() -> Iterator[Path]:
     """The run folder of ``pipewright desk``."""
-    with TemporaryDirectory(prefix="pipewright-") as name:
+    with alone(), TemporaryDirectory(prefix="pipewright-") as name:
         done = pipewright("desk", "--out", "run", *(f"--set={item}" for item in BRISK), cwd=Path(name), timeout=300.0)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "Traceback" not in done.stderr
@@ -73,6 +76,28 @@ def test_the_mission_completes_in_real_time(flown: Flown, told: dict[str, Any]) 
 def test_it_presses(told: dict[str, Any]) -> None:
     assert told["contact"]["source"] == "truth"
     assert told["contact"]["hold_mean"] == pytest.approx(1.5, abs=0.15)
+
+
+def test_the_force_is_held_and_known(told: dict[str, Any]) -> None:
+    assert told["force_rmse"]["meas_des"] <= 0.30
+    assert told["force_rmse"]["est_meas"] <= 0.20
+    assert told["contact"]["time_without_contact"] < 1.0
+
+
+def test_every_device_tells_how_it_does(told: dict[str, Any]) -> None:
+    devices, cpu = told["timing"]["devices"], told["timing"]["cpu"]
+    assert devices["odometry.POSE.rate"]["median"] == pytest.approx(200.0, rel=0.1)
+    assert devices["autopilot.ATTITUDE_QUATERNION.rate"]["median"] == pytest.approx(250.0, rel=0.1)
+    assert devices["servos.rate"]["median"] > 150.0
+    assert devices["autopilot.poses"]["last"] > 30.0 * told["sim_s"]
+    assert 0.02 < cpu["loop"]["median"] < 1.0
+    assert {"dynamixel", "mavsdk", "recorder"} <= set(cpu)
+
+
+def test_ticks_that_are_missed_are_counted(told: dict[str, Any]) -> None:
+    missed = told["timing"]["missed"]
+    assert missed["count"] == missed["late"] + missed["skipped"]
+    assert missed["share"] < 0.05
 
 
 def test_achieved_rates_are_told(told: dict[str, Any]) -> None:
