@@ -52,12 +52,14 @@ def load_config(
     sets: Sequence[str] = (),
     seed: int | None = None,
     directory: Path = CONFIGS,
+    option: str = "--scenario",
 ) -> Config:
     """Compose and check the configuration of a run.
 
     ``scenario`` is the name of a file in ``configs`` or ``configs/scenarios``, or a path to one; the ``config.yaml`` of
     a former run is taken as it stands. ``law`` names a file in ``configs/controllers``; else the scenario says which,
-    else ``tuned``. Raises ConfigError with every error, each naming its file and line or its option.
+    else ``tuned``. ``option`` is what the scenario was given by. Raises ConfigError with every error, each naming its
+    file and line or its option.
     """
     errors: list[str] = []
 
@@ -68,7 +70,7 @@ def load_config(
             errors.extend(error.errors)
             return None
 
-    scene = attempt(_scenario, scenario, directory)
+    scene = attempt(_scenario, scenario, directory, option)
     options = [layer for text in sets if (layer := attempt(_option, text))]
     layers: list[Layer | None]
     if scene and "scenario" in scene.values:
@@ -125,10 +127,10 @@ def _scenarios(directory: Path) -> dict[str, Path]:
     return {**whole, **_named_files(directory / "scenarios")}
 
 
-def _scenario(scenario: str, directory: Path) -> Layer:
+def _scenario(scenario: str, directory: Path, option: str) -> Layer:
     if "/" in scenario or "\\" in scenario or scenario.endswith((".yaml", ".yml")):
         return read_yaml(Path(scenario))
-    return _named("scenario", scenario, f"--scenario {scenario}", _scenarios(directory), directory / "scenarios")
+    return _named("scenario", scenario, f"{option} {scenario}", _scenarios(directory), directory / "scenarios")
 
 
 def _controller(law: Any, origin: str, directory: Path) -> Layer:

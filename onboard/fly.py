@@ -48,17 +48,17 @@ class Options(Struct, frozen=True):
 
 async def fly(
     config: Config,
-    log: Path,
+    prepare: Callable[[], Path],
     options: Options,
     load: Callable[[], Config],
     watch: Callable[[Outputs, float], None],
     say: Callable[[str], None],
 ) -> bool:
-    """Connect, run the loop until the flight is over, and record it to ``log``; False: broken off before it began.
+    """Connect, run the loop until the flight is over, and record it; False: broken off before it began.
 
-    ``load`` reads the configuration again, when a reload is asked for; ``watch`` sees outputs and time (s) of each
-    tick; ``say`` gets sentences for the person at the terminal. Raises DeviceError when a device cannot be had,
-    ConfigError for devices that cannot be flown.
+    ``prepare`` gives the path of the log, once there is something to record; ``load`` reads the configuration again,
+    when a reload is asked for; ``watch`` sees outputs and time (s) of each tick; ``say`` gets sentences for the person
+    at the terminal. Raises DeviceError when a device cannot be had, ConfigError for devices that cannot be flown.
     """
     devices = FlightDevices(config)
     with Notifier() as notifier:
@@ -69,7 +69,7 @@ async def fly(
                 if options.attended:
                     attended.watch(flight.order, lambda: end("standard input has closed"))
                 await devices.start(say)
-                await flight.run(log, load)
+                await flight.run(prepare(), load)
             finally:
                 notifier.stopping()
                 await devices.stop()

@@ -114,11 +114,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _prepare(config: Config, out: Path) -> Path:
-    """The path of the log in a fresh run folder. Checks the mission before anything is written."""
-    from onboard.core.derived import check_mission
-
-    check_mission(config)
+def _folder(config: Config, out: Path) -> Path:
+    """Make the run folder, with the configuration in it; gives the path of the log."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "config.yaml").write_text(dump_config(config))
@@ -128,10 +125,12 @@ def _prepare(config: Config, out: Path) -> Path:
 
 
 def _sim(options: argparse.Namespace) -> int:
+    from onboard.core.derived import check_mission
     from onboard.simulate import simulate
 
     config = load_config(options.scenario, options.law, options.sets, options.seed)
-    log = _prepare(config, options.out)
+    check_mission(config)
+    log = _folder(config, options.out)
     progress = Progress(not options.no_progress and sys.stderr.isatty())
     try:
         simulate(config, log, progress)
@@ -141,16 +140,17 @@ def _sim(options: argparse.Namespace) -> int:
 
 
 def _fly(options: argparse.Namespace) -> int:
+    from onboard.core.derived import check_mission
     from onboard.devices import check_devices
     from onboard.fly import Options, fly
     from onboard.scheduling import event_loop
 
     def load() -> Config:
-        return load_config(options.scenario, options.law, options.sets, options.seed)
+        return load_config(options.scenario, options.law, options.sets, options.seed, option="--config")
 
     config = load()
     check_devices(config)
-    log = _prepare(config, options.out)
+    check_mission(config)
     progress = Progress(not options.no_progress and sys.stderr.isatty())
 
     def say(text: str) -> None:
@@ -159,7 +159,7 @@ def _fly(options: argparse.Namespace) -> int:
     how = Options(options.mission, options.duration, options.attended)
     try:
         with asyncio.Runner(loop_factory=event_loop) as runner:
-            flown = runner.run(fly(config, log, how, load, progress, say))
+            flown = runner.run(fly(config, lambda: _folder(config, options.out), how, load, progress, say))
     finally:
         progress.close()
     return 0 if flown else INTERRUPTED
@@ -168,7 +168,8 @@ def _fly(options: argparse.Namespace) -> int:
 def _world(options: argparse.Namespace) -> int:
     from onboard.world import serve
 
-    serve(load_config(options.scenario, options.law, options.sets, options.seed), options.servo_link)
+    config = load_config(options.scenario, options.law, options.sets, options.seed, option="--config")
+    serve(config, options.servo_link)
     return 0
 
 
