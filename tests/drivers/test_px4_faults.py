@@ -63,6 +63,7 @@ async def rig() -> AsyncIterator[Rig]:
 @pytest.mark.parametrize("kind", [Kind.SILENT, Kind.UNPLUGGED])
 async def test_a_link_that_is_lost_comes_back(rig: Rig, kind: Kind) -> None:
     """In flight: PX4 lands meanwhile; the loss and the return are told once, and the rates are as before."""
+    rig.far.parameters.set("COM_DISARM_LAND", 9.0)
     await until(lambda: rig.state() == (True, FlightMode.OFFBOARD), rig.fly)
     before = rig.px4.latest()
     rig.inject(kind, 6.0)
