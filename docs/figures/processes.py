@@ -222,7 +222,7 @@ def tick() -> None:
         ("2  autopilot.latest()", ("attitude, IMU, armed,", "mode, battery")),
         ("3  servos.latest()", ("angles, rates, currents,", "errors of five servos")),
         ("4  request", ("of a person; one a tick,", "in order")),
-        ("5  obstacles()", ("why it must not arm:", "PX4's parameters, a mix")),
+        ("5  obstacles()", ("why it must not arm:", "sentences for a person")),
     )
     for number, (name, lines) in enumerate(sources):
         y = 30 + 84 * number
