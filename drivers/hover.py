@@ -3,12 +3,14 @@
 Every moment of hover tells how much the rotors would give at full set-point: the force that carried the vehicle over
 the fraction that its set-point stands for (``drivers.thrust``). Their logarithms lie on a line over the logarithm of
 the battery voltage, whose level is the thrust and whose slope is the exponent. The curves cannot be seen at one weight.
+Points far off the others (something carried or pulled, a gust) are left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import exp, log, sqrt
+from statistics import median
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -18,6 +20,8 @@ from drivers.thrust import ThrustMap, motor_signal, thrust_fraction
 #: A slope that is known no better than this is not taken (standard error, 1).
 SLOPE_ERROR = 0.3
 _LARGEST_EXPONENT = 3.0
+#: Standard deviations, and share of the thrust, beyond which a point does not belong to the others.
+_FAR, _LEAST_FAR = 4.0, 0.03
 
 
 class HoverPoint(Struct, frozen=True, gc=False):
@@ -41,6 +45,8 @@ class HoverFit(Struct, frozen=True):
     """Standard error of the voltage's exponent; infinite where the voltage never changed."""
     slope_taken: bool
     """The exponent is the hover's; else that of the map before."""
+    left_out: int
+    """Points that were far off the others."""
 
 
 def identify(points: Sequence[HoverPoint], before: ThrustMap) -> HoverFit:
@@ -53,7 +59,9 @@ def identify(points: Sequence[HoverPoint], before: ThrustMap) -> HoverFit:
     for point in points:
         if not (0.0 < point.force < 1e4 and 0.0 < point.set_point < 1.0 and 0.0 < point.voltage < 1e3):
             raise ValueError(f"{point} is no hover; force, set-point (below 1) and voltage must be above 0")
-    levels = [log(point.force / _fraction(point.set_point, before)) for point in points]
+    given = len(points)
+    points = _together(points, before)
+    levels = [_level(point, before) for point in points]
     volts = [log(point.voltage) for point in points]
     n = len(points)
     level, volt = sum(levels) / n, sum(volts) / n
@@ -78,7 +86,21 @@ def identify(points: Sequence[HoverPoint], before: ThrustMap) -> HoverFit:
         spread=sqrt(sum((y - level - slope * (v - volt)) ** 2 for v, y in zip(volts, levels, strict=True)) / n),
         slope_error=error,
         slope_taken=taken,
+        left_out=given - n,
     )
+
+
+def _together(points: Sequence[HoverPoint], before: ThrustMap) -> Sequence[HoverPoint]:
+    """Without those whose full thrust, brought to one voltage, is far off the median."""
+    full = [_level(point, before) - before.voltage_exponent * log(point.voltage) for point in points]
+    middle = median(full)
+    far = max(_FAR * 1.4826 * median(abs(level - middle) for level in full), _LEAST_FAR)
+    return [point for point, level in zip(points, full, strict=True) if abs(level - middle) <= far]
+
+
+def _level(point: HoverPoint, thrust: ThrustMap) -> float:
+    """Logarithm of the full thrust that a point tells."""
+    return log(point.force / _fraction(point.set_point, thrust))
 
 
 def _fraction(set_point: float, thrust: ThrustMap) -> float:

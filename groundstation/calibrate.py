@@ -212,7 +212,8 @@ def words_of(flown: Flown, fit: HoverFit) -> Iterator[str]:
         yield f"thrust goes with voltage to the power of {found.voltage_exponent:.2f} (+- {fit.slope_error:.2f})"
     else:
         yield f"the voltage changed too little to tell its exponent; {found.voltage_exponent:g} is kept"
-    yield f"the hover lies within {100 * fit.spread:.2f} % (rms) of the new map"
+    left_out = f"; {fit.left_out} of {len(points)} stretches were far off and left out" if fit.left_out else ""
+    yield f"the hover lies within {100 * fit.spread:.2f} % (rms) of the new map{left_out}"
     yield "put this into the configuration:"
 
 

@@ -61,9 +61,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         code: int = options.run(options)
+        sys.stdout.flush()
     except InputError as error:
         print(f"pipewright: {error}", file=sys.stderr)
         return WRONG_INPUT
+    except BrokenPipeError:
+        # Who read our output has seen enough; the interpreter must not complain of it at its end either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return COMPLETED
     return code
 
 

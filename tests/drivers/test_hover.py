@@ -57,6 +57,14 @@ def test_a_thrust_that_rises_as_the_battery_empties_is_not_believed() -> None:
     assert not identify(points, BEFORE).slope_taken
 
 
+def test_what_was_carried_for_a_moment_is_left_out() -> None:
+    leaning = [HoverPoint(18.0, TRUE.set_point(25.3, v), v) for v in falling(6)]
+    fit = identify([*hover(falling(60), noise=0.005), *leaning], BEFORE)
+    assert fit.left_out == 6
+    assert fit.thrust.full_force(15.6) == pytest.approx(TRUE.full_force(15.6), rel=0.005)
+    assert fit.spread < 0.01
+
+
 def test_the_curves_are_kept() -> None:
     found = identify(hover(falling(40)), BEFORE).thrust
     assert (found.curve, found.px4_curve) == (BEFORE.curve, BEFORE.px4_curve)
