@@ -29,7 +29,7 @@ from sim_backend.faults import Fault, Faults, read_faults
 from sim_backend.pace import Crier, Face, Pace
 from sim_backend.px4_emulator import Px4StandIn
 from sim_backend.px4_simulator_link import Px4SimulatorLink
-from sim_backend.px4_sitl import VARIABLE, Px4Sitl
+from sim_backend.px4_sitl import VARIABLE, Px4Sitl, battery_parameters
 from sim_backend.tracker import Tracker
 from sim_backend.world_link import WorldServer
 
@@ -69,6 +69,7 @@ class WorldProcess:
                 faces += [link, Crier(link.notices, say)]
                 if VARIABLE in os.environ and devices.simulator.startswith("tcp:"):
                     parameters = read_parameter_file(parameter_file(devices.autopilot))
+                    parameters |= battery_parameters(config.vehicle.battery)
                     px4 = Px4Sitl(Path(os.environ[VARIABLE]), parameters)
                     self._cleanup.callback(px4.stop)
                     px4.start()

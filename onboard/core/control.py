@@ -161,9 +161,9 @@ def step(
         ),
     )
     ahead = own.attitude_lead
-    attitude = math3.quat_from_euler(
-        (wanted[0] + ahead * wanted_rate[0], wanted[1] + ahead * wanted_rate[1], wanted[2] + ahead * wanted_rate[2])
-    )
+    heading = wanted[2] + ahead * wanted_rate[2]
+    leant = tilt.turned(wanted[0] + ahead * wanted_rate[0], wanted[1] + ahead * wanted_rate[1], rpy[2] - heading)
+    attitude = math3.quat_from_euler((*leant, heading))
     lift = reference.lift
     return (
         State(translation, tilted, sliding, filtered, joint_acceleration, contact, steady),

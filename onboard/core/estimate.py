@@ -141,10 +141,10 @@ def step(
         params.observer, dt,
     )  # fmt: skip
     if progress.taring:
-        watched = observer.accumulate(watched)
+        watched = observer.accumulate(watched, R)
         if progress.tared:
             watched = observer.finish_tare(watched)
-    force = observer.external_force(watched, params.observer)
+    force = observer.external_force(watched, R, params.observer)
     n = site.normal
     compression = -(force[0] * n[0] + force[1] * n[1])
 

@@ -9,7 +9,8 @@
 Eq. 11 adds the *desired* acceleration: in motion the observer then reads the trajectory's own acceleration as
 force. ``desired_acceleration`` keeps that form; without it the model is the thrust and gravity alone.
 F is the force on the vehicle; a pipe pressed with compression f pushes the vehicle back with -f along the
-contact normal. The tare subtracts what the observer reads in hover (mass, thrust and accelerometer errors).
+contact normal. The tare subtracts what the observer reads in hover. It belongs to B: errors of mass and thrust lie
+along the thrust, an accelerometer's along its own axes, and both turn with the vehicle when it leans into the pipe.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from typing import Annotated
 from msgspec import Struct
 
 from drivers.samples import Vec3
+from onboard.core import math3
+from onboard.core.types import Mat3
 from onboard.core.spec import note, spec
 
 
@@ -36,7 +39,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class State(Struct, frozen=True, gc=False):
-    """Filtered force F (N, W), lagged thrust (N), tare (N, W) and its running sum."""
+    """Filtered force F (N, W), lagged thrust (N), tare (N, B) and its running sum."""
 
     force: Vec3 = (0.0, 0.0, 0.0)
     thrust: float = 0.0
@@ -84,9 +87,9 @@ def step(
     )
 
 
-def accumulate(state: State) -> State:
+def accumulate(state: State, R_WB: Mat3) -> State:
     """Add the present reading to the running tare."""
-    f, t = state.force, state.total
+    f, t = math3.rotate_transposed(R_WB, state.force), state.total
     return State(state.force, state.thrust, state.tare, (t[0] + f[0], t[1] + f[1], t[2] + f[2]), state.count + 1)
 
 
@@ -97,9 +100,9 @@ def finish_tare(state: State) -> State:
     return State(state.force, state.thrust, (t[0] / n, t[1] / n, t[2] / n), (0.0, 0.0, 0.0), 0)
 
 
-def external_force(state: State, params: Params) -> Vec3:
+def external_force(state: State, R_WB: Mat3, params: Params) -> Vec3:
     """Estimated external force on the vehicle, tared when asked for, N, W."""
     if not params.tare:
         return state.force
-    f, t = state.force, state.tare
+    f, t = state.force, math3.rotate(R_WB, state.tare)
     return (f[0] - t[0], f[1] - t[1], f[2] - t[2])

@@ -16,7 +16,7 @@ eq. 5 and 6: the reference that the attitude law follows.
 
 from __future__ import annotations
 
-from math import asin, atan2, cos, sin, sqrt
+from math import asin, atan2, cos, hypot, sin, sqrt
 from typing import Annotated
 
 from msgspec import Struct
@@ -58,6 +58,18 @@ def attitude_and_thrust(force: Vec3, yaw: float, params: Params) -> tuple[float,
     roll, pitch = min(m, max(-m, roll)), min(m, max(-m, pitch))
     # the lift is kept even where the tilt is limited: the horizontal force that cannot be had is not made up by thrust
     return roll, pitch, lift / (cos(roll) * cos(pitch)) if params.exact else lift
+
+
+def turned(roll: float, pitch: float, turn: float) -> tuple[float, float]:
+    """Roll and pitch that lean the thrust the same way, told at a heading ``turn`` (rad) further back.
+
+    An autopilot leans the thrust first and turns to the heading later: told with the angles of another heading, it
+    would push aside.
+    """
+    ahead, right, up = cos(roll) * sin(pitch), sin(roll), cos(roll) * cos(pitch)
+    c, s = cos(turn), sin(turn)
+    ahead, right = c * ahead + s * right, c * right - s * ahead
+    return atan2(right, hypot(ahead, up)), atan2(ahead, up)
 
 
 def step(state: State, roll: float, pitch: float, params: Params, dt: float) -> tuple[State, float, float]:

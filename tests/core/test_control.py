@@ -164,6 +164,16 @@ def test_the_attitude_set_point_is_the_attitude_wanted() -> None:
     assert math3.euler_from_quat(wanted.q_WB) == pytest.approx(leading)
 
 
+@pytest.mark.parametrize("yaw", [0.2, -0.2])
+def test_the_attitude_set_point_pushes_where_it_is_wanted_before_the_heading_is_reached(yaw: float) -> None:
+    """An autopilot leans first and turns later: the push must not turn with a heading that is still wrong."""
+    _, wanted = act(believed((0.0, 0.0, yaw)), pressing(2.0), ticks=300, near_pipe=True)
+    R = math3.matrix_from_quat(wanted.q_WB)
+    assert math3.euler_from_quat(wanted.q_WB)[2] == pytest.approx(REFERENCE.yaw, abs=1e-9)
+    assert R[2] > 0.05
+    assert R[5] == pytest.approx(0.0, abs=0.001)
+
+
 # --- contact ----------------------------------------------------------------------------------------------------------
 
 

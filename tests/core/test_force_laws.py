@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.samples import Vec3
-from onboard.core import admittance, contact_trigger, force_profile, observer
+from onboard.core import admittance, contact_trigger, force_profile, math3, observer
 from tests.core.strategies import number, vector
 
 DT = 0.004
@@ -48,6 +48,8 @@ def test_admittance_is_bounded_odd_and_does_not_wind_up(accelerations: list[floa
 # --- observer ---------------------------------------------------------------------------------------------------------
 
 MASS, G = 2.4, 9.80665
+LEVEL = math3.matrix_from_euler((0.0, 0.0, 0.0))
+O: Vec3 = (0.0, 0.0, 0.0)
 REST = observer.State()
 
 
@@ -72,7 +74,7 @@ def observe(
 def test_observer_reads_the_external_force_at_any_tilt(force: Vec3, lean: float) -> None:
     axis = (lean, 0.0, (1.0 - lean * lean) ** 0.5)
     state = observe(force, observer.Params(), axis=axis)
-    assert observer.external_force(state, observer.Params()) == pytest.approx(force, abs=1e-6)
+    assert observer.external_force(state, LEVEL, observer.Params()) == pytest.approx(force, abs=1e-6)
 
 
 def test_observer_filter_is_equation_14() -> None:
@@ -96,11 +98,27 @@ def test_tare_removes_what_is_read_in_hover() -> None:
     p = observer.Params()
     state = observe((0.1, -0.05, 0.2), p)
     for _ in range(100):
-        state = observer.accumulate(observe((0.1, -0.05, 0.2), p, seconds=DT, state=state))
+        state = observer.accumulate(observe((0.1, -0.05, 0.2), p, seconds=DT, state=state), LEVEL)
     state = observer.finish_tare(state)
     assert state.count == 0
-    assert observer.external_force(state, p) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
-    assert observer.external_force(state, observer.Params(tare=False)) == pytest.approx((0.1, -0.05, 0.2), abs=1e-6)
+    assert observer.external_force(state, LEVEL, p) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    raw = observer.external_force(state, LEVEL, observer.Params(tare=False))
+    assert raw == pytest.approx((0.1, -0.05, 0.2), abs=1e-6)
+
+
+@pytest.mark.parametrize("share", [0.85, 1.1])
+def test_a_tare_in_hover_holds_for_a_leaning_vehicle_whose_thrust_is_not_what_is_commanded(share: float) -> None:
+    """A map of thrust that is wrong by a share: what it makes of 7 degrees of lean must not pass for a force."""
+    p, lean = observer.Params(), math3.matrix_from_euler((0.0, 0.12, 0.0))
+    told = share * MASS * G
+    state = observer.State()
+    for _ in range(500):
+        state = observer.step(state, O, O, told, (0.0, 0.0, 1.0), MASS, G, p, DT)
+    state = observer.finish_tare(observer.accumulate(state, LEVEL))
+    pushed = (-MASS * G * lean[2], 0.0, MASS * G * (1.0 - lean[8]))  # stands still with the thrust of the hover
+    for _ in range(500):
+        state = observer.step(state, O, O, told, (lean[2], lean[5], lean[8]), MASS, G, p, DT)
+    assert observer.external_force(state, lean, p) == pytest.approx(pushed, abs=1e-6)
 
 
 def test_thrust_lag_delays_the_model() -> None:

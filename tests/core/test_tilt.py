@@ -45,6 +45,13 @@ def test_printed_form_is_the_small_angle_limit(fx: float, fy: float, yaw: float)
     assert printed == pytest.approx(exact, abs=0.02)
 
 
+@given(number(0.4), number(0.4), number(3.1), number(3.1))
+def test_a_lean_told_at_another_heading_is_the_same_lean(roll: float, pitch: float, yaw: float, turn: float) -> None:
+    here = math3.matrix_from_euler((roll, pitch, yaw + turn))
+    there = math3.matrix_from_euler((*tilt.turned(roll, pitch, turn), yaw))
+    assert (there[2], there[5], there[8]) == pytest.approx((here[2], here[5], here[8]), abs=1e-12)
+
+
 @given(vector(1e6), number(10.0), st.booleans())
 def test_guarded_and_limited(force: Vec3, yaw: float, exact: bool) -> None:
     p = Params(exact=exact)
