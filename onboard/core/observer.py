@@ -21,8 +21,8 @@ from msgspec import Struct
 
 from drivers.samples import Vec3
 from onboard.core import math3
-from onboard.core.types import Mat3
 from onboard.core.spec import note, spec
+from onboard.core.types import Mat3
 
 
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
