@@ -79,7 +79,7 @@ class Dynamixel:
         self._port = port
         self._servos = tuple(Servo(index, servo) for index, servo in enumerate(settings.servos))
         self._notices = Notices()
-        self._teller = Teller(self._notices, clock)
+        self._teller = Teller(self._notices, clock, "servo bus")
         self._set_up = SetUp(settings, self._servos, self._teller.tell)
         self._goals = Goals(settings, self._servos, self._set_up, self._teller)
         self._watch = Watch(settings, self._servos, self._set_up, self._teller, clock)
@@ -276,13 +276,11 @@ class Dynamixel:
     def _lose(self, error: OSError) -> None:
         self._watch.errors["adapter lost"] += 1
         self._teller.tell(
-            Level.ERROR, f"the servo bus adapter on {self._settings.port} is gone ({error.strerror or error})"
+            Level.ERROR, f"the adapter on {self._settings.port} is gone ({error.strerror or error}); plug it in again"
         )
         self._close()
         self._began_ns = None
-        for servo in self._servos:
-            self._watch.give_up(servo)
-            servo.retry_ns = 0
+        self._watch.adapter_lost()
 
     def _reopen(self) -> None:
         now = self._clock()
@@ -294,4 +292,4 @@ class Dynamixel:
             self._bus = Bus(self._port(settings.port, settings.baud, settings.reply_margin))
         except DeviceError:
             return
-        self._teller.tell(Level.INFO, f"the servo bus adapter on {settings.port} is back")
+        self._teller.tell(Level.INFO, f"the adapter on {settings.port} is back")

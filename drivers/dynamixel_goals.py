@@ -18,6 +18,7 @@ from drivers.samples import JointMode, ServoCommand
 from drivers.xc330 import Item, Mode
 
 _JOINTS = 3
+_FAR = 0.05  # rad that a servo has to go back for its arrival to be told
 
 
 class Goals:
@@ -29,6 +30,7 @@ class Goals:
         self._set_up = set_up
         self._teller = teller
         self._goals_ns = 0
+        self._away: list[Servo] = []
 
     def apply(self, bus: Bus, command: ServoCommand, now: int) -> None:
         """Write what ``command`` asks for; ``now`` in nanoseconds."""
@@ -49,6 +51,10 @@ class Goals:
         }
         if goals:
             bus.sync_write(WRITE_AT, WRITE.size, goals)
+        if self._away and not any(servo.homing is not None for servo in self._servos):
+            names = ", ".join(servo.name for servo in self._away)
+            self._teller.tell(Level.INFO, f"{names} {'is' if len(self._away) == 1 else 'are'} back at the goal")
+            self._away.clear()
 
     def _goal(self, servo: Servo, command: ServoCommand, now: int, dt: float) -> bytes:
         if servo.mode is Mode.CURRENT:
@@ -66,8 +72,9 @@ class Goals:
             servo.homing += min(max(goal - servo.homing, -most), most)
             if servo.homing == goal:
                 servo.homing = None
-                self._teller.tell(Level.INFO, f"{servo.name} is back at its goal")
             else:
+                if servo not in self._away and servo.answers and abs(goal - servo.homing) > _FAR:
+                    self._away.append(servo)
                 goal = servo.homing
         limit = command.current_limit if servo.index < _JOINTS else servo.settings.current_limit
         return WRITE.pack(abs(servo.limited(limit)), servo.counts(goal))

@@ -10,10 +10,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 
 from drivers import xc330
+from drivers.dynamixel_absence import Absences
 from drivers.dynamixel_bus import Bus, BusError, Corrupt, NoAnswer, Refused
 from drivers.dynamixel_settings import DynamixelSettings
 from drivers.dynamixel_setup import HEALTH, MARK, READ, READ_AT, Servo, SetUp
-from drivers.mailbox import Level, Teller
+from drivers.mailbox import Level, Teller, Trouble
 from drivers.samples import Five, ServoState
 from drivers.xc330 import HardwareError
 
@@ -36,6 +37,10 @@ class Watch:
         self._set_up = set_up
         self._teller = teller
         self._clock = clock
+        self._absences = Absences(servos, teller)
+        self._readings = Trouble(teller.tell, "every reading of the servos succeeds again; {count} failed")
+        self._failed_ns: list[int] = []
+        self._failure = ""
         self._one_by_one = False
         self._health_ns = 0
         self._health_turn = 0
@@ -59,8 +64,9 @@ class Watch:
             if suspects:
                 heard.append(self._read_alone(bus, min(suspects, key=lambda servo: servo.asked)))
         lost = [servo for servo in asked if servo.suspect and now - servo.heard_ns > self._settings.silent_after * 1e9]
-        if lost:
-            self._miss(lost)
+        for servo in lost:
+            self.give_up(servo)
+        self._absences.lost(lost)
         return self._sample() if any(heard) else None
 
     def _read_together(self, bus: Bus, servos: Sequence[Servo]) -> list[bool]:
@@ -71,7 +77,8 @@ class Watch:
         except BusError as error:
             # Who is at fault shows when each is asked by itself, in the next cycle.
             self._one_by_one = True
-            self._teller.once("read", Level.WARNING, f"a reading of the servos failed: {error}")
+            self._failed_ns.append(self.reading_ns)
+            self._failure = f"a reading of the servos failed: {error}"
             raise
         return [self._take(servo, answer.data) for servo, answer in zip(servos, answers, strict=True)]
 
@@ -84,16 +91,12 @@ class Watch:
             return False
         return self._take(servo, answer.data)
 
-    def _miss(self, lost: Sequence[Servo]) -> None:
-        for servo in lost:
+    def adapter_lost(self) -> None:
+        """Nothing can be read any more, and why was told."""
+        for servo in self._servos:
             self.give_up(servo)
-        names = ", ".join(servo.name for servo in lost)
-        self._teller.tell(
-            Level.ERROR,
-            f"{names} does not answer any more; the others go on"
-            if any(servo.answers for servo in self._servos)
-            else "no servo answers any more: is the 5 V supply on, and is the data cable plugged in?",
-        )
+            servo.retry_ns = 0
+        self._absences.known(self._servos)
 
     def give_up(self, servo: Servo) -> None:
         """Take a servo for lost, until it is found again."""
@@ -111,6 +114,7 @@ class Watch:
         if mark != MARK:
             self._teller.tell(Level.ERROR, f"{servo.name} has restarted by itself: is its supply steady?")
             self.give_up(servo)
+            self._absences.known([servo])
             servo.retry_ns = 0
             return False
         servo.suspect, servo.heard_ns = False, self.reading_ns
@@ -162,7 +166,8 @@ class Watch:
         )
 
     def tend(self, bus: Bus, now: int) -> None:
-        """At most one thing beside the cycle: reboot, look for a lost servo, or look at the health of one."""
+        """Tell what there is; and at most one thing beside the cycle: reboot, find or look at the health of a servo."""
+        self._tell(now)
         for servo in self._servos:
             try:
                 if servo.reboot_ns is not None and servo.answers and now >= servo.reboot_ns:
@@ -184,6 +189,16 @@ class Watch:
             if servo.answers and not servo.suspect and not self._one_by_one:
                 self._look_at_health(bus, servo)
 
+    def _tell(self, now: int) -> None:
+        self._absences.check(now)
+        self._readings.check(now)
+        # A servo that falls silent fails a reading first: that is one trouble, and not two.
+        if self._failed_ns and now - self._failed_ns[0] > 2e9 * self._settings.silent_after:
+            if not self._absences:
+                for failed_ns in self._failed_ns:
+                    self._readings.happened(failed_ns, self._failure)
+            self._failed_ns.clear()
+
     def _look_at_health(self, bus: Bus, servo: Servo) -> None:
         try:
             answer = bus.read_bytes(servo.settings.id, xc330.PRESENT_VOLTAGE.address, HEALTH.size)
@@ -199,6 +214,7 @@ class Watch:
         self._teller.tell(Level.WARNING, f"{servo.name}: reboot {servo.reboots} of {self._settings.reboots}")
         bus.reboot(servo.settings.id)
         self.give_up(servo)
+        self._absences.known([servo])
         servo.interrupted = True
         servo.retry_ns = now + round(_WAKING * 1e9)
 
@@ -211,7 +227,7 @@ class Watch:
         servo.answers = True
         servo.heard_ns = self._clock()
         servo.error = 0
-        self._teller.tell(Level.INFO, f"{servo.name} answers again{', restarted' if mark != MARK else ''}")
+        self._absences.back(servo, mark != MARK, servo.heard_ns)
 
     def count(self, error: BusError) -> None:
         """Count a failed transaction; its servo is asked by itself next."""

@@ -15,6 +15,7 @@ T = TypeVar("T")
 _WINDOW_NS = 1_000_000_000
 _KEPT_NOTICES = 256
 _TELL_AGAIN_NS = 10_000_000_000
+_CALM_NS = 1_000_000_000
 
 
 class MailboxCounts(Struct, frozen=True, gc=False):
@@ -114,16 +115,18 @@ class Notices:
 
 
 class Teller:
-    """Tells sentences with the time of a clock; what happens again and again, once in ten seconds."""
+    """Tells sentences of a device with the time of a clock; what happens again and again, once in ten seconds."""
 
-    def __init__(self, notices: Notices, clock: Callable[[], int]) -> None:
+    def __init__(self, notices: Notices, clock: Callable[[], int], device: str) -> None:
+        """``device`` begins every sentence."""
         self._notices = notices
         self._clock = clock
+        self._device = device
         self._told: dict[str, tuple[int, int]] = {}
 
     def tell(self, level: Level, text: str) -> None:
         """Tell it."""
-        self._notices.tell(self._clock(), level, text)
+        self._notices.tell(self._clock(), level, f"{self._device}: {text}")
 
     def once(self, key: str, level: Level, text: str) -> None:
         """Tell it, unless the same was told within the last ten seconds; then count it for the next time."""
@@ -134,3 +137,32 @@ class Teller:
             return
         self._told[key] = (now, 0)
         self.tell(level, f"{text} (and {more} times since it was last told)" if more else text)
+
+
+class Trouble:
+    """What may go wrong again and again: told when it begins, and when it has been over for a second."""
+
+    def __init__(self, tell: Callable[[Level, str], None], over: str) -> None:
+        """``over`` is said at the end; ``{count}`` in it is how often it has happened."""
+        self._tell = tell
+        self._over = over
+        self._count = 0
+        self._last_ns = 0
+
+    @property
+    def active(self) -> bool:
+        """It has happened, and has not been over for long enough."""
+        return self._count > 0
+
+    def happened(self, now: int, text: str) -> None:
+        """Once more, at ``now`` in ns."""
+        self._last_ns = now
+        self._count += 1
+        if self._count == 1:
+            self._tell(Level.WARNING, text)
+
+    def check(self, now: int) -> None:
+        """Tell the end, if this is it."""
+        if self._count and now - self._last_ns > _CALM_NS:
+            count, self._count = self._count, 0
+            self._tell(Level.INFO, self._over.format(count=count))

@@ -34,6 +34,7 @@ from drivers.frames import (
 from drivers.mailbox import Level, Mailbox, MailboxCounts, Notice, Notices
 from drivers.protocols import DeviceError
 from drivers.px4_parameters import INT32, Value, bits_of_float, differences, read_parameter_file
+from drivers.px4_watch import LinkWatch
 from drivers.rotation import inverse, rotate
 from drivers.samples import (
     AutopilotCommand,
@@ -245,8 +246,9 @@ _HEARTBEAT_NS = 1_000_000_000
 _TEXT_NS = 500_000_000
 #: MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, MAV_STATE_ACTIVE.
 _GROUND_STATION = '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
-_RATE_CHECK_NS = 3_000_000_000
-_RATE_TOLERANCE = 0.8
+_JUDGED = ("ATTITUDE_QUATERNION", "HIGHRES_IMU")  # streams whose rate is judged
+_TRIP_NS = 100_000_000  # between two questions after the round trip
+_KEPT_TRIPS = 50  # so many of them may be unanswered
 _REBOOT_MS = 1000  # PX4's time does not go back further than packets can overtake each other
 _PARAMETER_ROUNDS = 4  # so many times a parameter is asked for
 _PARAMETER_PATIENCE = 0.5  # s without an answer, after which a round ends
@@ -297,12 +299,13 @@ class Px4:
         self._task: asyncio.Task[None] | None = None
         self._asking: set[asyncio.Task[None]] = set()
         self._tuning: asyncio.Task[None] | None = None
-        self._linked = True
         self._heard_ns = -(10**18)
+        self._watch = LinkWatch(self._tell, settings.rate)
+        self._last_attitude: _AttitudeQuaternion | None = None
+        self._trips_begun: tuple[int, ...] = ()
+        self._trip_due_ns = 0
         self._boot_ms = 0
         self._intervals_due = False
-        self._slow: set[str] = set()
-        self._rates_checked_ns = 0
 
         self._wanted: Engage | None = None
         self._reached = False
@@ -383,7 +386,6 @@ class Px4:
         if system.autopilot_type() != mavsdk.Autopilot.PX4:
             raise DeviceError(f"autopilot: {url} answers as {system.autopilot_type().name}; want a PX4")
 
-        system.subscribe_is_connected(self._on_link)
         self._direct = MavlinkDirect(system)
         self._param = Param(system)
         self._subscribe("ATTITUDE_QUATERNION", _AttitudeQuaternion, self._on_attitude)
@@ -400,7 +402,7 @@ class Px4:
         await self._ask_intervals()
         await self._wait_for_samples()
         await self._compare_parameters()
-        self._rates_checked_ns = self._clock()
+        self._watch.begin(self._clock())
         self._task = asyncio.create_task(self._work(), name="px4")
 
     async def _wait_for_samples(self) -> None:
@@ -593,15 +595,15 @@ class Px4:
             await asyncio.sleep(_PERIOD)
             self._send("COMMAND_LONG", _command_json(_HEARTBEAT))
             self._keep_texts_coming()
-            self._judge_rates()
+            self._look_at_link()
             if self._wanted is Engage.KILL:
                 self._work_towards_kill()
             elif (ask := self._next_ask()) is not None:
                 self._begin(self._try(ask))
-            if self._intervals_due and self._linked and (self._tuning is None or self._tuning.done()):
+            if self._intervals_due and self._watch.linked and (self._tuning is None or self._tuning.done()):
                 self._intervals_due = False
                 self._tuning = self._begin(self._ask_intervals())
-            if self._parameters_due and self._linked and (self._comparing is None or self._comparing.done()):
+            if self._parameters_due and self._watch.linked and (self._comparing is None or self._comparing.done()):
                 self._parameters_due = False
                 self._comparing = self._begin(self._compare_parameters())
 
@@ -633,7 +635,7 @@ class Px4:
     def _next_ask(self) -> _Ask | None:
         """What brings PX4 nearer to the wanted state. A state once reached is not fought for against a pilot."""
         mode, now = self._mode.latest(), self._clock()
-        if mode is None or not self._linked:
+        if mode is None or not self._watch.linked:
             return None
         ask: _Ask | None = None
         if self._wanted is Engage.OFFBOARD:
@@ -667,7 +669,7 @@ class Px4:
 
     async def _try(self, ask: _Ask) -> None:
         reason = await self._ask(ask)
-        if reason:
+        if reason and self._watch.linked:  # of a lost link the loss was told
             self._refuse(f"{ask.words}: {reason}")
 
     async def _ask(self, ask: _Ask) -> str:
@@ -718,24 +720,17 @@ class Px4:
         else:
             self._tell(Level.INFO, f"PX4 holds the {len(wanted)} parameters of {self._settings.parameters}")
 
-    def _judge_rates(self) -> None:
-        now = self._clock()
-        if now - self._rates_checked_ns < _RATE_CHECK_NS or not self._linked:
-            return
-        self._rates_checked_ns = now
-        for name in ("ATTITUDE_QUATERNION", "HIGHRES_IMU"):
-            achieved = self._boxes[name].counts(now).rate
-            if achieved >= _RATE_TOLERANCE * self._settings.rate:
-                self._slow.discard(name)
-                continue
-            # A PX4 that has rebooted sends at its default rates.
+    def _look_at_link(self) -> None:
+        now, watch = self._clock(), self._watch
+        if watch.check(now):
+            self._intervals_due = self._parameters_due = True
+        # A PX4 that has rebooted sends at its default rates.
+        if watch.judge_rates(now, lambda: {name: self._boxes[name].counts(now).rate for name in _JUDGED}):
             self._intervals_due = True
-            if name not in self._slow:
-                self._slow.add(name)
-                self._tell(
-                    Level.WARNING,
-                    f"{name} comes at {achieved:.0f} Hz, asked for {self._settings.rate:g} Hz; asking again",
-                )
+        if now >= self._trip_due_ns:
+            self._trip_due_ns = now + _TRIP_NS
+            self._trips_begun = (*self._trips_begun[-_KEPT_TRIPS:], now)
+            self._send_timesync(0, now)
 
     # -- what MAVSDK's thread calls -------------------------------------------------------------------------------
 
@@ -747,12 +742,14 @@ class Px4:
             now = self._clock()
             if message.component_id != _AUTOPILOT:
                 return
+            self._watch.heard(now)
             try:
                 take(decode(message.fields_json), now)
             except (msgspec.DecodeError, ValueError):
                 # A number that is not finite arrives as null.
                 if box is not None:
                     box.reject()
+                    self._watch.unusable(now, name)
 
         self._direct.subscribe_message(name, on_message)
 
@@ -761,11 +758,17 @@ class Px4:
             self._intervals_due = self._parameters_due = True
             self._tell(Level.ERROR, "PX4 has rebooted: its time began anew")
         self._boot_ms = m.time_boot_ms
+        before, self._last_attitude = self._last_attitude, m
+        same = before is not None and _same_attitude(before, m) and self._landed.latest() is Landed.IN_AIR
+        self._watch.moves(now, same)
+        if same:
+            return  # its age must tell
         attitude = attitude_from_px4((m.q1, m.q2, m.q3, m.q4))
-        self._attitude.put(_Attitude(now, attitude, body_from_px4((m.rollspeed, m.pitchspeed, m.yawspeed))), now)
+        rates = body_from_px4((m.rollspeed, m.pitchspeed, m.yawspeed))
+        self._attitude.put(_Attitude(now - self._watch.lateness, attitude, rates), now)
 
     def _on_imu(self, m: _HighresImu, now: int) -> None:
-        self._imu.put(_Imu(now, body_from_px4((m.xacc, m.yacc, m.zacc))), now)
+        self._imu.put(_Imu(now - self._watch.lateness, body_from_px4((m.xacc, m.yacc, m.zacc))), now)
 
     def _on_motion(self, m: _LocalPosition, now: int) -> None:
         self._motion.put(Motion(now, world_from_px4((m.x, m.y, m.z)), world_from_px4((m.vx, m.vy, m.vz))), now)
@@ -805,15 +808,17 @@ class Px4:
         if text is not None:
             worse = text.severity < _WARNING
             level = Level.ERROR if worse else Level.WARNING if text.severity == _WARNING else Level.INFO
-            self._told.tell(text.t_ns, level, f"PX4: {text.text.rstrip()}")
+            self._told.tell(text.t_ns, level, f"autopilot: PX4 says: {text.text.rstrip()}")
 
     def _on_timesync(self, m: _Timesync, now: int) -> None:
-        # PX4 asks for the time here, and so learns to read the times of the poses.
+        # PX4 asks for the time here, and so learns to read the times of the poses; or it answers such a question.
         if m.tc1 == 0:
-            self._send(
-                "TIMESYNC",
-                f'{{"tc1":{now},"ts1":{m.ts1},"target_system":{_SYSTEM},"target_component":{_AUTOPILOT}}}',
-            )
+            self._send_timesync(now, m.ts1)
+        elif m.ts1 in self._trips_begun:
+            self._watch.answered(now, m.ts1)
+
+    def _send_timesync(self, tc1: int, ts1: int) -> None:
+        self._send("TIMESYNC", f'{{"tc1":{tc1},"ts1":{ts1},"target_system":{_SYSTEM},"target_component":{_AUTOPILOT}}}')
 
     def _on_parameter(self, m: _ParamValue, now: int) -> None:
         name = m.param_id.rstrip("\0")
@@ -824,16 +829,6 @@ class Px4:
             self._whole.add(name)
         else:
             self._held[name] = bits_of_float(m.param_value)
-
-    def _on_link(self, connected: bool, _: object) -> None:
-        if connected == self._linked:
-            return
-        self._linked = connected
-        if connected:
-            self._intervals_due = self._parameters_due = True
-            self._tell(Level.WARNING, "the link to PX4 is back")
-        else:
-            self._tell(Level.ERROR, "the link to PX4 is lost: no heartbeat")
 
     # -- words ----------------------------------------------------------------------------------------------------
 
@@ -851,6 +846,13 @@ def _connect(hub: Any, url: str) -> None:
     """Raises MAVSDK's error when the connection cannot be opened."""
     with named("mavsdk"):
         hub.add_any_connection_with_handle(url)
+
+
+def _same_attitude(a: _AttitudeQuaternion, b: _AttitudeQuaternion) -> bool:
+    """To the bit; their times may differ."""
+    return (a.q1, a.q2, a.q3, a.q4, a.rollspeed, a.pitchspeed, a.yawspeed) == (
+        b.q1, b.q2, b.q3, b.q4, b.rollspeed, b.pitchspeed, b.yawspeed
+    )  # fmt: skip
 
 
 @cache

@@ -19,7 +19,7 @@ from msgspec import Meta, Struct
 
 from drivers.device_clock import DeviceClock
 from drivers.frames import attitude_from_tracker, from_tracker
-from drivers.mailbox import Level, Mailbox, MailboxCounts, Notice, Notices
+from drivers.mailbox import Level, Mailbox, MailboxCounts, Notice, Notices, Trouble
 from drivers.protocols import DeviceError
 from drivers.samples import Odometry
 from drivers.threads import named
@@ -83,31 +83,10 @@ class T265Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 _QUALITY = (-1, 33, 66, 100)
 _PERIOD = 0.05  # of the watchdog, s
-_CALM_NS = 1_000_000_000
+_RATE = 200.0  # of the poses, Hz
+_ENOUGH = 0.8
+_RATE_PERIOD_NS = 1_000_000_000
 _OFF = {"enable_relocalization": "relocalisation", "enable_pose_jumping": "pose jumping"}
-
-
-class _Trouble:
-    """Something that may go wrong 200 times a second: told when it begins, and when it has been over for a second."""
-
-    def __init__(self, tell: Callable[[Level, str], None], over: str) -> None:
-        self._tell = tell
-        self._over = over
-        self._count = 0
-        self._last_ns = 0
-
-    def happened(self, now: int, text: str) -> None:
-        """Once more."""
-        self._last_ns = now
-        self._count += 1
-        if self._count == 1:
-            self._tell(Level.WARNING, text)
-
-    def check(self, now: int) -> None:
-        """Tell the end, if this is it."""
-        if self._count and now - self._last_ns > _CALM_NS:
-            count, self._count = self._count, 0
-            self._tell(Level.INFO, self._over.format(count=count))
 
 
 class T265:
@@ -143,9 +122,12 @@ class T265:
         start = settings.start or (0.0, 0.0, 0.0)
         self._tracking = Tracking(settings.mount, settings.jump, start, radians(settings.start_heading_deg))
         self._device_clock = DeviceClock()
-        self._unusable = _Trouble(self._tell, "its poses are usable again; {count} were not")
-        self._jumps = _Trouble(self._tell, "no more jumps; there were {count}")
-        self._drifts = _Trouble(self._tell, "its clock keeps time again")
+        self._unusable = Trouble(self._tell, "its poses are usable again; {count} were not")
+        self._jumps = Trouble(self._tell, "no more jumps; there were {count}")
+        self._drifts = Trouble(self._tell, "its clock keeps time again")
+        self._slow = Trouble(self._tell, f"its poses come at {_RATE:.0f} Hz again")
+        self._slow_seconds = 0
+        self._rate_due_ns = 0
 
     # -- life cycle -----------------------------------------------------------------------------------------------
 
@@ -343,6 +325,20 @@ class T265:
             self._drifts.happened(now, f"its clock is {way} by {abs(drift) * 1e6:.0f} ppm")
         for trouble in (self._unusable, self._jumps, self._drifts):
             trouble.check(now)
+        if now >= self._rate_due_ns:
+            self._rate_due_ns = now + _RATE_PERIOD_NS
+            self._judge_rate(now)
+
+    def _judge_rate(self, now: int) -> None:
+        """Once a second: a camera that is slow in two of them on end, and not silent or of no use, loses poses."""
+        self._slow.check(now)
+        rate = self._poses.counts(now).rate
+        calm = self._settings.replay == "" and not self._unusable.active
+        self._slow_seconds = self._slow_seconds + 1 if calm and rate < _ENOUGH * _RATE else 0
+        if now - self._fresh_ns > self._settings.silence * 1e9:
+            self._slow_seconds = 0
+        if self._slow_seconds > 1:
+            self._slow.happened(now, f"its poses come at {rate:.0f} Hz, want {_RATE:.0f} Hz: check USB 3 and the load")
 
     def _tell(self, level: Level, text: str) -> None:
         self._told.tell(self._clock(), level, f"tracker: {text}")

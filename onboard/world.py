@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -76,6 +77,8 @@ class WorldProcess:
                 received = lambda: link.received  # noqa: E731
             if kinds["servos"] is Kind.EMULATED:
                 bus = devices.servos
+                if servo_link is None:  # the name of a terminal may be another's when an adapter comes back
+                    servo_link = Path(self._cleanup.enter_context(TemporaryDirectory(prefix="pipewright-"))) / "servos"
                 emulator = emulate(bus.servos, world=world, link=servo_link, baud=bus.baud, faults=config.faults)
                 emulator.start()
                 self._cleanup.callback(emulator.stop)

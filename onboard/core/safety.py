@@ -327,7 +327,7 @@ WORDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType({
 
     "odometry_late": (
         "odometry older than {p.odometry_late} s",
-        "Odometry is {f.age_odometry:.2f} s old. Check the tracker's cable and load.",
+        "Odometry is {f.age_odometry:.2f} s old: the tracker is silent, late, or repeats itself. Check cable and load.",
     ),
     "odometry_lost": (
         "odometry older than {p.odometry_lost} s",
@@ -382,7 +382,7 @@ WORDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType({
     ),
     "servo_error": (
         "any hardware-error bit",
-        "Servo hardware error, bits {f.servo_error:#04x}. Land, and reboot the servo.",
+        "Servo trouble, bits {f.servo_error:#04x} (0x20 overload, 0x80 silent). Land, and see to the servo.",
     ),
     "servo_torque": ("servo torque off in flight", "The servos have no torque: the arm hangs. Land with care."),
     "servo_warm": (

@@ -451,7 +451,8 @@ async def test_the_next_command_starts_them_again_slowly(rig: Rig) -> None:
         return rig.state().position == pytest.approx(home, abs=0.01)
 
     await rig.until(there, lambda: command(position=home))
-    assert rig.heard("theta_1 (id 3) is back at its goal")
+    everybody = "theta_1 (id 3), theta_2 (id 7), theta_3 (id 4), pump (id 9), gripper (id 12)"
+    await rig.until(lambda: rig.heard(f"{everybody} are back at the goal"), lambda: command(position=home))
     # The emulated servos themselves would run at 8.5 rad/s; a late cycle makes one larger step.
     assert sorted(speeds)[len(speeds) // 2] < 2.0 * rig.settings.homing_speed
 
@@ -508,6 +509,7 @@ async def test_a_silent_servo_is_told_once_the_others_go_on_and_its_return_is_to
     await rig.until(lambda: rig.state().position == pytest.approx(new, abs=0.01), lambda: command(position=new))
     rig.emulator.faults.clear()
     await rig.until(lambda: rig.state().error == (0,) * 5 and rig.state().torque_on, lambda: command(position=new))
+    await rig.until(lambda: rig.heard("theta_2 (id 7) answers again"), lambda: command(position=new))
     assert sum("theta_2 (id 7) answers again" in text for text in rig.texts()) == 1
 
 
@@ -517,13 +519,13 @@ FAULTS: dict[Kind, tuple[float | None, float, str, tuple[str, ...]]] = {
     Kind.CORRUPT: (None, 0.1, "", ("a reading of the servos failed",)),
     Kind.TRUNCATE: (None, 0.1, "", ("a reading of the servos failed",)),
     Kind.WRONG_ID: (None, 0.1, "", ("a reading of the servos failed",)),
-    Kind.DELAY: (None, 0.06, "", ("a reading of the servos failed",)),
+    Kind.DELAY: (None, 0.06, "", ("no servo answers any more",)),
     Kind.SILENT: (0.5, 0.0, "theta_2", ("theta_2 (id 7) does not answer any more", "theta_2 (id 7) answers again")),
     Kind.ERROR_BIT: (
         0.0, HardwareError.OVERLOAD, "pump", ("pump (id 9): overload", "reboot 1 of 3", "answers again, restarted"),
     ),
     Kind.REBOOT: (0.5, 0.0, "theta_3", ("theta_3 (id 4) does not answer any more", "answers again, restarted")),
-    Kind.UNPLUGGED: (0.5, 0.0, "", ("the servo bus adapter on", "is back")),
+    Kind.UNPLUGGED: (0.5, 0.0, "", ("servo bus: the adapter on", "is back")),
 }  # fmt: skip
 
 
@@ -594,12 +596,12 @@ async def test_overload_is_rebooted_and_the_servo_comes_back_slowly(rig: Rig) ->
     rig.free.position[0] += 0.4  # it has given way
     await rig.until(lambda: rig.state().error[0] & HardwareError.OVERLOAD != 0, command)
     assert not rig.state().torque_on
-    await rig.until(lambda: rig.heard("theta_1 (id 3) answers again, restarted"), command)
+    await rig.until(lambda: rig.heard("theta_1 (id 3): reboot 1 of 3"), command)
     await rig.until(lambda: rig.state().torque_on, command)
     assert rig.state().position[0] > GOALS[0] + 0.2  # not at once
     await rig.until(lambda: rig.state().position == pytest.approx(GOALS, abs=0.01), command)
     assert rig.heard("overload; its torque is off, it is rebooted in 0.1 s")
-    assert rig.heard("theta_1 (id 3): reboot 1 of 3")
+    await rig.until(lambda: rig.heard("theta_1 (id 3) answers again, restarted"), command)
     assert rig.state().error == (0, 0, 0, 0, 0)
 
 
@@ -691,6 +693,10 @@ class Steps:
         state = self.driver.latest()
         return state is not None and state.t_ns == self.now
 
+    def told(self) -> list[str]:
+        """What the driver has told since the last call."""
+        return [notice.text for notice in self.driver.notices()]
+
 
 @pytest.mark.parametrize("error", [NoAnswer(None, "x"), Corrupt(None, "x"), Corrupt(2, "x"), Refused(5, "x")])
 async def test_one_failure_costs_one_sample(error: BusError) -> None:
@@ -701,7 +707,11 @@ async def test_one_failure_costs_one_sample(error: BusError) -> None:
     assert (
         steps.driver.statistics().errors[{NoAnswer: "no answer", Corrupt: "corrupt"}.get(type(error), "refused")] == 1
     )
-    assert [notice.text for notice in steps.driver.notices()] == ["a reading of the servos failed: x"]
+    assert all(steps.cycle() for _ in range(400))
+    assert steps.told() == [
+        "servo bus: a reading of the servos failed: x",
+        "servo bus: every reading of the servos succeeds again; 1 failed",
+    ]
 
 
 async def test_a_servo_that_falls_silent_costs_one_sample_and_is_told_once() -> None:
@@ -711,21 +721,46 @@ async def test_a_servo_that_falls_silent_costs_one_sample_and_is_told_once() -> 
     state = steps.driver.latest()
     assert state is not None
     assert state.error == (0, 0, HardwareError.SILENT, 0, 0)
-    texts = [notice.text for notice in steps.driver.notices()]
-    assert texts == [
-        "a reading of the servos failed: no answer",
-        "theta_3 (id 3) does not answer any more; the others go on",
-    ]
+    assert steps.told() == ["servo bus: theta_3 (id 3) does not answer any more; the others go on"]
     # From then on it is not asked with the others.
     steps.bus.asked.clear()
     steps.cycle()
     assert steps.bus.asked == [1, 2, 4, 5]
     steps.bus.absent.clear()
-    assert all(steps.cycle() for _ in range(80))
-    assert [notice.text for notice in steps.driver.notices()] == ["theta_3 (id 3) answers again"]
+    assert all(steps.cycle() for _ in range(400))
+    assert steps.told() == ["servo bus: theta_3 (id 3) answers again"]
     state = steps.driver.latest()
     assert state is not None
     assert state.error == (0, 0, 0, 0, 0)
+
+
+async def test_a_servo_that_comes_and_goes_is_told_once() -> None:
+    steps = Steps()
+    for _ in range(20):
+        steps.bus.absent = {2}
+        for _ in range(60):
+            steps.cycle()
+        steps.bus.absent.clear()
+        for _ in range(100):
+            steps.cycle()
+    assert steps.told() == ["servo bus: theta_2 (id 2) does not answer any more; the others go on"]
+    for _ in range(300):
+        steps.cycle()
+    assert steps.told() == ["servo bus: theta_2 (id 2) answers again"]
+
+
+async def test_servos_that_come_back_are_told_together() -> None:
+    steps = Steps()
+    steps.bus.absent = {1, 2, 3, 4, 5}
+    for _ in range(60):
+        steps.cycle()
+    steps.bus.absent.clear()
+    for _ in range(400):
+        steps.cycle()
+    assert steps.told() == [
+        "servo bus: no servo answers any more: is the 5 V supply on, and is the data cable plugged in?",
+        "servo bus: theta_1 (id 1), theta_2 (id 2), theta_3 (id 3), pump (id 4), gripper (id 5) answer again",
+    ]
 
 
 async def test_two_silent_servos_are_waited_for_one_at_a_time() -> None:

@@ -107,7 +107,7 @@ def test_a_servo_that_keeps_its_mode_gets_no_strength() -> None:
         assert stubborn.get(xc330.OPERATING_MODE) == Mode.CURRENT
         assert stubborn.get(xc330.GOAL_CURRENT) == 0
     told = [notice.text for notice in bench.driver.notices()]
-    assert "a command did not reach servo 2: it did not take the operating mode" in told
+    assert "servo bus: a command did not reach servo 2: it did not take the operating mode" in told
     stubborn.write = write  # type: ignore[method-assign]
     bench.cycle(HOLD)
     assert stubborn.get(xc330.OPERATING_MODE) == Mode.CURRENT_BASED_POSITION

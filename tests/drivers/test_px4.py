@@ -327,8 +327,8 @@ async def test_a_refusal_is_told_with_px4s_reason(pair: tuple[Px4, Px4StandIn]) 
 
     want = {
         "autopilot: arming: temporarily rejected",
-        "PX4: Arming denied: Resolve system health failures first",
-        "PX4: Critical battery",
+        "autopilot: PX4 says: Arming denied: Resolve system health failures first",
+        "autopilot: PX4 says: Critical battery",
     }
     await until(lambda: want <= set(told), tick)
 
@@ -347,13 +347,14 @@ async def test_loss_and_return_of_the_link() -> None:
     try:
         await px4.start()
         first.stop()
-        await until(lambda: (Level.ERROR, "autopilot: the link to PX4 is lost: no heartbeat") in told, listen)
+        lost = "autopilot: the link to PX4 is lost: nothing comes any more; check its cable and power"
+        await until(lambda: (Level.ERROR, lost) in told, listen)
         stale = px4.latest()
         px4.command(command())  # survives
         second = Px4StandIn(World(VEHICLE), bind=("127.0.0.1", port))
         second.start()
         try:
-            await until(lambda: (Level.WARNING, "autopilot: the link to PX4 is back") in told, listen)
+            await until(lambda: any("autopilot: the link to PX4 is back after" in text for _, text in told), listen)
             fresh = px4.latest()
             assert stale is not None
             assert fresh is not None
@@ -403,10 +404,10 @@ async def test_long_status_texts_are_joined(pair: tuple[Px4, Px4StandIn]) -> Non
     await until(
         lambda: len(told) == 5, lambda: told.extend((n.level, n.text) for n in px4.notices() if "abc" in n.text)
     )
-    assert told == [(Level.WARNING, f"PX4: {text}") for text in texts]
+    assert told == [(Level.WARNING, f"autopilot: PX4 says: {text}") for text in texts]
     stand_in._say(Severity.ERROR, texts[1])  # and nothing after it
     await until(
-        lambda: told[-1] == (Level.ERROR, f"PX4: {texts[1]}"),
+        lambda: told[-1] == (Level.ERROR, f"autopilot: PX4 says: {texts[1]}"),
         lambda: told.extend((n.level, n.text) for n in px4.notices() if "abc" in n.text),
     )
 

@@ -205,9 +205,11 @@ class Flying:
         return self.wait("hover", lambda look: look.truth.p_WB[2] > 0.75)
 
     def hover(self) -> Look:
-        """Up to the hover, from the first preflight or after a ``reset``; the takeoff is over."""
-        self.take_off()
-        return self.wait("hold", lambda look: look.phase == Phase.HOLD)
+        """Up to the hover, whatever its height, from the first preflight or after a ``reset``; the takeoff is over."""
+        self.wait_said("ready")
+        self.ask("takeoff")
+        taking_off = self.wait("takeoff", lambda look: look.phase == Phase.TAKEOFF)
+        return self.wait("hover", lambda look: look.phase == Phase.HOLD, since=taking_off)
 
     def land(self) -> Look:
         """Down by request."""
