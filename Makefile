@@ -30,9 +30,13 @@ sim: $(RUN)
 # The last gate before the actuators is covered to the last branch, or the tests fail.
 GATE_TEST := tests/core/test_limits.py
 
+# What flies in real time has the machine to itself.
 test: $(DEV)
+ifneq ($(strip $(ARGS)),)
 	$(PY) -m pytest -n 2 --dist loadscope $(ARGS)
-ifeq ($(strip $(ARGS)),)
+else
+	$(PY) -m pytest -n 2 --dist loadscope -m "not realtime"
+	$(PY) -m pytest -m realtime
 	$(PY) -m pytest -q $(GATE_TEST) --cov=onboard.core.limits --cov-branch --cov-report=term-missing --cov-fail-under=100
 endif
 

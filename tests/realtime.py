@@ -1,4 +1,8 @@
-"""Real-time flights of one machine come one after the other: two at once would only measure each other."""
+"""Real-time flights of one machine come one after the other: two at once would only measure each other.
+
+Nor does anything else run beside them in ``make test``: a pseudo-terminal's bytes are carried by workers of the kernel
+that wait their turn behind every busy process, whatever the priority of ours.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-#: For tests with such flights, s: they also wait for those of others.
-LONGEST = 1800
+import pytest
+
+#: Marks of a module with such flights. They also wait for those of others.
+REALTIME = [pytest.mark.realtime, pytest.mark.timeout(1800)]
 
 
 @contextmanager

@@ -15,9 +15,9 @@ import pytest
 
 from onboard.replay import replay
 from tests.acceptance.flights import Flown, completed, look, pipewright
-from tests.realtime import LONGEST, alone
+from tests.realtime import REALTIME, alone
 
-pytestmark = pytest.mark.timeout(LONGEST)
+pytestmark = REALTIME
 
 #: About 65 s of flight: a near pipe, brisk motion, a light and short press.
 BRISK = (

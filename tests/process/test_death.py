@@ -10,9 +10,9 @@ import pytest
 
 from onboard.replay import replay
 from tests.process.flying import flying
-from tests.realtime import LONGEST
+from tests.realtime import REALTIME
 
-pytestmark = pytest.mark.timeout(LONGEST)
+pytestmark = REALTIME
 
 #: COM_OF_LOSS_T, and what may come on top of it, s.
 LOSS, MARGIN = 0.5, 0.2

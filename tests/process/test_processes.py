@@ -21,9 +21,9 @@ from onboard.logfile import LogReader
 from onboard.records import EVENT
 from tests.acceptance.flights import COMMAND
 from tests.process.flying import PATIENCE, Flying
-from tests.realtime import LONGEST, alone
+from tests.realtime import REALTIME, alone
 
-pytestmark = pytest.mark.timeout(LONGEST)
+pytestmark = REALTIME
 
 
 def onboard(*arguments: str, stdin: str = "", timeout: float = PATIENCE) -> subprocess.CompletedProcess[str]:
