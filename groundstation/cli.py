@@ -50,7 +50,7 @@ examples:
 """
 _ONBOARD_EPILOG = """\
 examples:
-  pipewright onboard --config jetson                           waits on the ground for what it is asked
+  pipewright onboard --config jetson --attended                waits on the ground for what it is asked
   pipewright onboard --config /etc/pipewright.yaml --mission --out /var/log/pipewright/today
 """
 _LOG_HELP = "log.mcap of a run, or its run folder"
@@ -107,6 +107,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     onboard.add_argument("--config", dest="scenario", required=True, metavar="NAME|FILE", help="devices, pipe, task")
     onboard.add_argument("--duration", type=float, metavar="SECONDS", help="land after this time")
+    onboard.add_argument(
+        "--attended",
+        action="store_true",
+        help="take requests (takeoff, start, land, ...) as lines of standard input",
+    )
     onboard.add_argument("--mission", action="store_true", help="fly the whole mission once preflight passes, then end")
     onboard.set_defaults(run=_onboard)
     words = "hold a simulated world with emulated devices for a flight process elsewhere"
@@ -156,15 +161,14 @@ def _parser() -> argparse.ArgumentParser:
 def _sim(options: argparse.Namespace) -> int:
     begun, out = time.perf_counter(), _out(options)
     before = _written(out / "log.mcap")
-    code = _flight_process(["sim", *_common(options), *_run_options(options, out)])
+    code = _flight_process(["sim", "--out", str(out), *_common(options), *_run_options(options)])
     return _outcome(code, out / "log.mcap", before, begun)
 
 
 def _desk(options: argparse.Namespace) -> int:
     begun, out = time.perf_counter(), _out(options)
     before = _written(out / "log.mcap")
-    arguments = ["--mission", *_run_options(options, out)]
-    arguments += [] if options.duration is None else [f"--duration={options.duration}"]
+    arguments = ["--mission", "--out", str(out), *_run_options(options)]
     try:
         with Desk(_common(options)) as desk:
             endpoints = desk.start_world()
@@ -180,8 +184,8 @@ def _desk(options: argparse.Namespace) -> int:
 
 
 def _onboard(options: argparse.Namespace) -> int:
-    arguments = ["fly", *_common(options), *_run_options(options, _out(options))]
-    arguments += [] if options.duration is None else [f"--duration={options.duration}"]
+    arguments = ["fly", "--out", str(_out(options)), *_common(options), *_run_options(options)]
+    arguments += ["--attended"] if options.attended else []
     _become([*arguments, "--mission"] if options.mission else arguments)
 
 
@@ -199,8 +203,10 @@ def _common(options: argparse.Namespace) -> list[str]:
     return [*arguments, *(f"--set={item}" for item in options.sets)]
 
 
-def _run_options(options: argparse.Namespace, out: Path) -> list[str]:
-    return ["--out", str(out), *(["--no-progress"] if options.no_progress else [])]
+def _run_options(options: argparse.Namespace) -> list[str]:
+    duration = getattr(options, "duration", None)
+    quiet = ["--no-progress"] if options.no_progress else []
+    return [*quiet, *([] if duration is None else [f"--duration={duration}"])]
 
 
 def _out(options: argparse.Namespace) -> Path:

@@ -135,6 +135,7 @@ class _Flight:
             try:
                 with Collector(config.process) as self._collector:
                     await loop.run(self._on_tick)
+                self._notifier.stopping()  # from here on no tick tells systemd that we live
                 if (command := self.ending.handed_over) is not None:
                     sentence = await hand_over(devices.autopilot, command, clock)
                     self._tell(Event(clock.now_ns(), "handed_over", Severity.WARNING, sentence))

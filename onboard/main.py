@@ -129,6 +129,8 @@ def _sim(options: argparse.Namespace) -> int:
     from onboard.simulate import simulate
 
     config = load_config(options.scenario, options.law, options.sets, options.seed)
+    if config.faults:
+        raise ConfigError(["faults: the devices of a simulated run are mocks, which have none; fly it on the desk"])
     check_mission(config)
     log = _folder(config, options.out)
     progress = Progress(not options.no_progress and sys.stderr.isatty())

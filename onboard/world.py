@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -36,6 +37,9 @@ from sim_backend.world_link import WorldServer
 
 #: After which the thread of one emulator hands the interpreter to another's, s: each answers within milliseconds.
 SWITCH_INTERVAL = 0.0005
+#: A flight process that is left alone lands first; the world stays for it, but not longer, s.
+LAST_FLIGHT = 150.0
+_GLANCE = 0.05
 
 
 class WorldProcess:
@@ -107,6 +111,11 @@ class WorldProcess:
                 raise ConfigError([str(error)]) from error
             raise
 
+    @property
+    def flown_in(self) -> bool:
+        """Somebody flies in it."""
+        return self._server.flown_in
+
     def inject(self, fault: Fault) -> None:
         """One that begins now, or ``start`` seconds from now. Raises ValueError where no emulator can show it."""
         faults = self._faults.get(fault.device)
@@ -121,7 +130,7 @@ class WorldProcess:
 
 
 def serve(config: Config, servo_link: Path | None = None) -> None:
-    """Hold the world until standard input closes, or SIGINT or SIGTERM comes."""
+    """Hold the world until standard input has closed and nobody flies in it any more, or SIGINT or SIGTERM comes."""
 
     def say(text: str) -> None:
         sys.stderr.write(f"{text}\n")
@@ -132,6 +141,12 @@ def serve(config: Config, servo_link: Path | None = None) -> None:
 
     def stop(*_: Any) -> None:
         pace.stop()
+
+    def leave() -> None:
+        until = time.monotonic() + LAST_FLIGHT
+        while process.flown_in and time.monotonic() < until:
+            time.sleep(_GLANCE)
+        stop()
 
     def order(line: str) -> None:
         try:
@@ -145,7 +160,7 @@ def serve(config: Config, servo_link: Path | None = None) -> None:
     try:
         sys.stdout.write(msgspec.json.encode(process.endpoints).decode() + "\n")
         sys.stdout.flush()
-        attended.watch(order, stop)
+        attended.watch(order, leave)
         pace.run()
     finally:
         process.close()

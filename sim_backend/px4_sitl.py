@@ -47,6 +47,7 @@ class Px4Sitl:
     def __init__(
         self, build: Path, parameters: Mapping[str, int | float], instance: int = 0, folder: Path | None = None
     ) -> None:
+        build = build.resolve()  # PX4 runs in another folder
         self._binary, self._scripts = build / "bin" / "px4", build / "etc"
         for needed in (self._binary, self._scripts):
             if not needed.exists():

@@ -13,7 +13,7 @@ import msgspec
 from drivers.mailbox import Mailbox
 from drivers.protocols import DeviceError
 from drivers.samples import AutopilotCommand, AutopilotState, Odometry, ServoCommand, ServoState
-from sim_backend.world_messages import HELLO, LARGEST, Camera, Command, Hello, Look, encode, from_world
+from sim_backend.world_messages import HELLO, LARGEST, Bye, Camera, Command, Hello, Look, encode, from_world
 
 #: How often the camera's stream is looked at, s.
 _GLANCE = 0.02
@@ -66,6 +66,7 @@ class WorldClient:
         thread, self._thread = self._thread, None
         if thread is not None:
             thread.join()
+            self._send(encode(Bye()))
         self._socket.close()
 
     def latest(self) -> Look | None:

@@ -13,7 +13,7 @@ from drivers.protocols import DeviceError
 from sim_backend.mock_devices import Clock, MockAutopilot, MockOdometry, MockServos
 from sim_backend.tracker import Tracker
 from sim_backend.world import World
-from sim_backend.world_messages import LARGEST, Address, Camera, Hello, Look, encode, to_world
+from sim_backend.world_messages import LARGEST, Address, Bye, Camera, Hello, Look, encode, to_world
 
 #: Who has said nothing for so long is gone, s.
 PATIENCE = 2.0
@@ -62,6 +62,11 @@ class WorldServer:
         return f"{host}:{port}"
 
     @property
+    def flown_in(self) -> bool:
+        """Somebody flies in this world."""
+        return any(hello.phase for hello, _ in self._peers.values())
+
+    @property
     def streaming(self) -> bool:
         """Somebody has opened the camera's stream."""
         return any(hello.streaming for hello, _ in self._peers.values())
@@ -86,6 +91,8 @@ class WorldServer:
                     self._phase = message.phase
                     for enter in self._on_phase:
                         enter(message.phase, self._world.time)
+            elif isinstance(message, Bye):
+                self._peers.pop(address, None)
             else:
                 autopilot, _, servos = self._mocks
                 if message.autopilot is not None:

@@ -68,6 +68,10 @@ class Hello(Struct, frozen=True, tag=True, gc=False):
     """Devices whose samples are wanted: autopilot, odometry, servos."""
 
 
+class Bye(Struct, frozen=True, tag=True, gc=False):
+    """The last word of a client."""
+
+
 class Command(Struct, frozen=True, tag=True, gc=False):
     """For the mock devices."""
 
@@ -77,4 +81,4 @@ class Command(Struct, frozen=True, tag=True, gc=False):
 
 encode = msgspec.msgpack.Encoder().encode
 from_world = msgspec.msgpack.Decoder(Look | Camera).decode
-to_world = msgspec.msgpack.Decoder(Hello | Command).decode
+to_world = msgspec.msgpack.Decoder(Hello | Command | Bye).decode

@@ -253,7 +253,7 @@ def tick() -> None:
         ("10  recorder", ("Tick and timing; once a second", "the state, as a keyframe")),
         ("11  sleep until due", ("by the schedule, not from now;", "here drivers' tasks run")),
     )
-    sheet.arrow((740, 231), (810, 231), words=["Outputs"])
+    sheet.arrow((740, 231), (775, 231), (775, 63), (810, 63), words=["Outputs"], at=(775, 248))
     for number, (name, lines) in enumerate(results):
         y = 30 + 84 * number
         sheet.box(810, y, 250, 66, name, lines)

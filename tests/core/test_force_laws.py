@@ -49,7 +49,7 @@ def test_admittance_is_bounded_odd_and_does_not_wind_up(accelerations: list[floa
 
 MASS, G = 2.4, 9.80665
 LEVEL = math3.matrix_from_euler((0.0, 0.0, 0.0))
-NOTHING: Vec3 = (0.0, 0.0, 0.0)
+STILL: Vec3 = (0.0, 0.0, 0.0)
 REST = observer.State()
 
 
@@ -113,11 +113,11 @@ def test_a_tare_in_hover_holds_for_a_leaning_vehicle_whose_thrust_is_not_what_is
     told = share * MASS * G
     state = observer.State()
     for _ in range(500):
-        state = observer.step(state, NOTHING, NOTHING, told, (0.0, 0.0, 1.0), MASS, G, p, DT)
+        state = observer.step(state, STILL, STILL, told, (0.0, 0.0, 1.0), MASS, G, p, DT)
     state = observer.finish_tare(observer.accumulate(state, LEVEL))
     pushed = (-MASS * G * lean[2], 0.0, MASS * G * (1.0 - lean[8]))  # stands still with the thrust of the hover
     for _ in range(500):
-        state = observer.step(state, NOTHING, NOTHING, told, (lean[2], lean[5], lean[8]), MASS, G, p, DT)
+        state = observer.step(state, STILL, STILL, told, (lean[2], lean[5], lean[8]), MASS, G, p, DT)
     assert observer.external_force(state, lean, p) == pytest.approx(pushed, abs=1e-6)
 
 

@@ -39,12 +39,12 @@ def flight(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         record(out / "log.mcap")
         return 0
 
-    monkeypatch.setattr(cli, "_onboard", fly)
+    monkeypatch.setattr(cli, "_flight_process", fly)
     return calls
 
 
 def fake(monkeypatch: pytest.MonkeyPatch, function: Fake) -> None:
-    monkeypatch.setattr(cli, "_onboard", function)
+    monkeypatch.setattr(cli, "_flight_process", function)
 
 
 def test_run_folder_holds_everything(flight: list[list[str]], capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +26,7 @@ def until(condition: Callable[[], bool]) -> None:
     end = time.monotonic() + LONG
     while not condition():
         assert time.monotonic() < end, "the condition never held"
-        time.sleep(0.01)
+        select.select([], [], [], 0.01)
 
 
 def build(folder: Path, script: str = WAITS) -> Path:
