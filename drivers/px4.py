@@ -250,7 +250,7 @@ _JUDGED = ("ATTITUDE_QUATERNION", "HIGHRES_IMU")  # streams whose rate is judged
 _TRIP_NS = 100_000_000  # between two questions after the round trip
 _KEPT_TRIPS = 50  # so many of them may be unanswered
 _REBOOT_MS = 1000  # PX4's time does not go back further than packets can overtake each other
-_PARAMETER_ROUNDS = 4  # so many times a parameter is asked for
+_PARAMETER_ROUNDS = 8  # so many times a parameter is asked for
 _PARAMETER_PATIENCE = 0.5  # s without an answer, after which a round ends
 
 
