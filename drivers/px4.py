@@ -250,7 +250,7 @@ _JUDGED = ("ATTITUDE_QUATERNION", "HIGHRES_IMU")  # streams whose rate is judged
 _TRIP_NS = 100_000_000  # between two questions after the round trip
 _KEPT_TRIPS = 50  # so many of them may be unanswered
 _REBOOT_MS = 1000  # PX4's time does not go back further than packets can overtake each other
-_PARAMETER_ROUNDS = 4  # so many times a parameter is asked for
+_PARAMETER_ROUNDS = 8  # so many times a parameter is asked for
 _PARAMETER_PATIENCE = 0.5  # s without an answer, after which a round ends
 
 
@@ -310,6 +310,8 @@ class Px4:
         self._wanted: Engage | None = None
         self._reached = False
         self._left = False
+        self._seen: _Mode | None = None
+        self._seen_told = False
         self._commanded_ns = -(10**18)
         self._stream_began_ns = 0
         self._asked: dict[_Ask, int] = {}
@@ -637,6 +639,8 @@ class Px4:
         mode, now = self._mode.latest(), self._clock()
         if mode is None or not self._watch.linked:
             return None
+        if mode != self._seen:
+            self._seen, self._seen_told = mode, False
         ask: _Ask | None = None
         if self._wanted is Engage.OFFBOARD:
             there = mode.armed and mode.mode is FlightMode.OFFBOARD
@@ -661,7 +665,9 @@ class Px4:
             return None
         if there and not self._reached:
             self._reached = True
-            self._tell(Level.INFO, f"PX4 is {'armed' if mode.armed else 'disarmed'}, mode {mode.mode}")
+            if not self._seen_told:
+                self._seen_told = True
+                self._tell(Level.INFO, f"PX4 is {'armed' if mode.armed else 'disarmed'}, mode {mode.mode}")
         if ask is None or self._reached or now - self._asked.get(ask, -_ASK_AGAIN_NS) < _ASK_AGAIN_NS:
             return None
         self._asked[ask] = now

@@ -104,14 +104,11 @@ class LinkWatch:
         if now < self._rates_due_ns:
             return False
         self._rates_due_ns = now + _RATE_PERIOD_NS
-        self._slow.check(now)
-        if not self.linked or self._frozen.active or self._unusable.active:
-            self._slow_before = frozenset()
-            return False
-        slow = {name: rate for name, rate in achieved().items() if rate < _ENOUGH * self._rate}
+        told = not self.linked or self._frozen.active or self._unusable.active
+        slow = {} if told else {name: rate for name, rate in achieved().items() if rate < _ENOUGH * self._rate}
         still = [f"{name} comes at {rate:.0f} Hz" for name, rate in slow.items() if name in self._slow_before]
         self._slow_before = frozenset(slow)
-        if not still:
-            return False
-        self._slow.happened(now, f"{' and '.join(still)}, asked for {self._rate:g} Hz; asking again")
-        return True
+        if still:
+            self._slow.happened(now, f"{' and '.join(still)}, asked for {self._rate:g} Hz; asking again")
+        self._slow.check(now)
+        return bool(still)

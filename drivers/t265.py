@@ -331,7 +331,6 @@ class T265:
 
     def _judge_rate(self, now: int) -> None:
         """Once a second: a camera that is slow in two of them on end, and not silent or of no use, loses poses."""
-        self._slow.check(now)
         rate = self._poses.counts(now).rate
         calm = self._settings.replay == "" and not self._unusable.active
         self._slow_seconds = self._slow_seconds + 1 if calm and rate < _ENOUGH * _RATE else 0
@@ -339,6 +338,7 @@ class T265:
             self._slow_seconds = 0
         if self._slow_seconds > 1:
             self._slow.happened(now, f"its poses come at {rate:.0f} Hz, want {_RATE:.0f} Hz: check USB 3 and the load")
+        self._slow.check(now)
 
     def _tell(self, level: Level, text: str) -> None:
         self._told.tell(self._clock(), level, f"tracker: {text}")
