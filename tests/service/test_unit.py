@@ -72,7 +72,7 @@ def test_systemd_has_nothing_to_say_against_it(analyze: str, tmp_path: Path, dro
 
 
 def test_it_can_do_little_beyond_its_task(analyze: str) -> None:
-    command = [analyze, "security", "--offline=yes", f"--threshold={round(EXPOSED * 10)}", "--no-pager", UNIT]
+    command = [analyze, "security", "--offline=yes", f"--threshold={round(EXPOSED * 10)}", "--no-pager", str(UNIT)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 
