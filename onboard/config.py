@@ -71,7 +71,9 @@ def load_config(
             return None
 
     scene = attempt(_scenario, scenario, directory, option)
+    no_scene = len(errors)
     options = [layer for text in sets if (layer := attempt(_option, text))]
+    no_options = len(errors) - no_scene
     layers: list[Layer | None]
     if scene and "scenario" in scene.values:
         if law is not None:
@@ -91,10 +93,13 @@ def load_config(
             Layer("--scenario", {"scenario": scenario}),
             Layer("--law", {"law": given}),
         ]
-    if errors:
-        raise ConfigError(errors)
     options += [] if seed is None else [Layer(f"--seed {seed}", {"seed": seed})]
-    return compose(Config, [*filter(None, layers), *options])
+    everything = [*filter(None, layers), *options]
+    # an option that cannot be read hides nothing of what is wrong with the others
+    config = attempt(lambda: compose(Config, everything)) if len(errors) == no_options else None
+    if config is None or errors:
+        raise ConfigError(errors)
+    return config
 
 
 def load_config_file(path: Path) -> Config:

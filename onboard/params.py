@@ -145,23 +145,32 @@ class _Reader:
 
     def _unknown(self, path: Key, value: Any, siblings: Sequence[str]) -> None:
         """Note a key that is not declared, with the nearest that are."""
-        near = {dotted((*path[:-1], name)) for name in siblings}
+        near = [dotted((*path[:-1], name)) for name in siblings]
         depth = len(path)
         while isinstance(value, Mapping) and len(value) == 1:  # An option: all of its name is what was meant.
             ((key, value),) = value.items()
             path = (*path, key)
-        wrong, leaf, deep = dotted(path), path[-1], len(path) > depth
-
-        def likeness(name: str) -> tuple[float, float, str]:
-            whole = _ratio(wrong, name)
-            last = _ratio(leaf, name.rpartition(".")[2]) * (1.0 if name in near else 0.95)
-            return max(last, whole if deep else _ratio(leaf, name)), whole, name
-
-        indexed = any(part.isdecimal() for part in path)
-        names = near | {name for name in _names(self.root) if not (indexed and ".N." in name)}
-        best = [name for score, _, name in sorted(map(likeness, names), reverse=True)[:3] if score >= 0.6]
+        best = nearest(self.root, path, near, deep=len(path) > depth)
         hint = f"nearest: {', '.join(best)}" if best else f"known here: {', '.join(siblings)}"
         self.fail(path, f": no such parameter; {hint}")
+
+
+def nearest(root: type[Struct], path: Key, near: Sequence[str] = (), *, deep: bool = True) -> list[str]:
+    """Up to three declared names that a wrong one may have meant, the likeliest first.
+
+    near: names beside the wrong one, which are likelier. deep: the wrong part may stand anywhere in the path, and not
+    only at its end.
+    """
+    wrong, leaf = dotted(path), path[-1]
+
+    def likeness(name: str) -> tuple[float, float, str]:
+        whole = _ratio(wrong, name)
+        last = _ratio(leaf, name.rpartition(".")[2]) * (1.0 if name in near else 0.95)
+        return max(last, whole if deep else _ratio(leaf, name)), whole, name
+
+    indexed = any(part.isdecimal() for part in path)
+    names = {*near, *(name for name in _names(root) if not (indexed and ".N." in name))}
+    return [name for score, _, name in sorted(map(likeness, names), reverse=True)[:3] if score >= 0.6]
 
 
 def _ratio(a: str, b: str) -> float:
