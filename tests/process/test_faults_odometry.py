@@ -10,9 +10,9 @@ import pytest
 from onboard.core.types import Action, Phase
 from sim_backend.tracker import KINDS
 from tests.process.book import Book, Told, again, lands, strikes
-from tests.realtime import LONGEST
+from tests.realtime import REALTIME
 
-pytestmark = pytest.mark.timeout(LONGEST)
+pytestmark = REALTIME
 
 CAMERA = "odometry"
 STORIES = {
