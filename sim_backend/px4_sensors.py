@@ -1,7 +1,8 @@
 """What PX4's own sensors measure in a simulated world: HIL_SENSOR and HIL_GPS messages.
 
 North of PX4 is +y of W, as everywhere (``drivers/frames.py``). The inertial sensors err as ``sensors.SensorParams``
-says; magnetometer, barometer and GPS have their own noise here.
+says; magnetometer, barometer and GPS have their own noise here, always: PX4 takes a barometer whose readings repeat for
+a failed one.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class Px4Sensors:
 
     def measure(self, now: Snapshot) -> list[Any]:
         """The messages of one sample of the inertial sensors, 250 a second; GPS comes every 50th time."""
-        noise = np.zeros(_NOISE) if self._exact else self._random.standard_normal(_NOISE)
+        noise = self._random.standard_normal(_NOISE)
         messages = [self._sensor(now, noise[:10])]
         if self._gps and self._taken % _GPS_EVERY == 0:
             messages.append(self._position(now, noise[10:]))
