@@ -182,9 +182,14 @@ def lands(device: str, kind: str, duration: float, **fault: object) -> Story:
     return story
 
 
-def again(flight: Flying) -> None:
-    """Land if it flies, and hover once more, as if nothing had been."""
+def down(flight: Flying) -> None:
+    """Land if it flies, and be ready for the next flight."""
     if flight.look().phase != Phase.STOPPED:
         flight.land()
     flight.reset()
+
+
+def again(flight: Flying) -> None:
+    """Land if it flies, and hover once more, as if nothing had been."""
+    down(flight)
     flight.hover()
