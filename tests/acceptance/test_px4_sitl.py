@@ -23,7 +23,7 @@ from tests.px4_traffic import GroundStation
 from tests.realtime import alone
 
 pytestmark = [
-    pytest.mark.timeout(LONGEST),
+    *REALTIME,
     pytest.mark.skipif(build_folder() is None, reason=f"no PX4: {VARIABLE} names no build folder of one (docs/px4.md)"),
 ]
 
