@@ -20,7 +20,7 @@ from sim_backend.px4_sitl import VARIABLE, build_folder
 from tests.acceptance.flights import Flown, completed, look, pipewright, within
 from tests.process.flying import PATIENCE, Flying
 from tests.px4_traffic import GroundStation
-from tests.realtime import alone
+from tests.realtime import REALTIME, alone
 
 pytestmark = [
     *REALTIME,
