@@ -20,10 +20,10 @@ from sim_backend.px4_sitl import VARIABLE, build_folder
 from tests.acceptance.flights import Flown, completed, look, pipewright, within
 from tests.process.flying import PATIENCE, Flying
 from tests.px4_traffic import GroundStation
-from tests.realtime import LONGEST, alone
+from tests.realtime import REALTIME, alone
 
 pytestmark = [
-    pytest.mark.timeout(LONGEST),
+    *REALTIME,
     pytest.mark.skipif(build_folder() is None, reason=f"no PX4: {VARIABLE} names no build folder of one (docs/px4.md)"),
 ]
 

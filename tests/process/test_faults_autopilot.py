@@ -11,9 +11,9 @@ from onboard.core.types import Action, Phase
 from sim_backend.px4_emulator import KINDS
 from tests.process.book import Book, again, down, lands, strikes
 from tests.process.flying import Flying
-from tests.realtime import LONGEST
+from tests.realtime import REALTIME
 
-pytestmark = pytest.mark.timeout(LONGEST)
+pytestmark = REALTIME
 
 PX4 = "autopilot"
 

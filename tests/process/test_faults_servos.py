@@ -11,9 +11,9 @@ from drivers.xc330 import HardwareError
 from onboard.core.types import Action, Phase
 from sim_backend.dynamixel_troubles import KINDS
 from tests.process.book import Book, Told, again, strikes
-from tests.realtime import LONGEST
+from tests.realtime import REALTIME
 
-pytestmark = pytest.mark.timeout(LONGEST)
+pytestmark = REALTIME
 
 BUS = "servos"
 #: Of the answers, one in twenty is lost or spoilt: a dozen a second.
