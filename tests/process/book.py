@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -123,12 +123,19 @@ class Told(Struct):
 class Book:
     """All stories of one flight."""
 
-    def __init__(self, folder: Path, stories: Mapping[str, Story], *sets: str) -> None:
-        """Fly them. One that fails ends the flight: it and those after it fail when they are asked for."""
+    def __init__(
+        self,
+        folder: Path,
+        stories: Mapping[str, Story],
+        *sets: str,
+        begin: Callable[[Flying], object] = Flying.hover,
+        arguments: Sequence[str] = (),
+    ) -> None:
+        """Fly ``begin``, then them. One that fails ends the flight: it and those after it fail when asked for."""
         self._told: dict[str, Told] = {}
         self._failed = ""
-        with flying(folder, *sets) as flight:
-            flight.hover()
+        with flying(folder, *sets, arguments=arguments) as flight:
+            begin(flight)
             for name, story in stories.items():
                 began = flight.look().t_ns
                 try:

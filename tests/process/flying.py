@@ -8,7 +8,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Condition
@@ -70,8 +70,10 @@ class Line(NamedTuple):
 class Flying:
     """World and flight process of one configuration. Use as a context manager."""
 
-    def __init__(self, folder: Path, *sets: str, config: str = "desk") -> None:
+    def __init__(self, folder: Path, *sets: str, config: str = "desk", arguments: Sequence[str] = ()) -> None:
+        """``arguments`` are for the flight process alone."""
         self.folder = folder
+        self._arguments = arguments
         self._common = [f"--config={config}", *(f"--set={item}" for item in (*BRISK, *sets))]
         self.looks: list[Look] = []
         self.lines: list[Line] = []
@@ -86,7 +88,7 @@ class Flying:
         self.client.start(PATIENCE)
         sets = [f"--set={path}={value}" for path, value in self.endpoints.items()]
         out = ["--out", str(self.folder), "--no-progress"]
-        arguments = ["fly", *self._common, *sets, "--attended", *out]
+        arguments = ["fly", *self._common, *sets, "--attended", *self._arguments, *out]
         self.flight = start(arguments, stderr=subprocess.PIPE, program=("-c", _STICKY))
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
@@ -241,7 +243,7 @@ class Flying:
 
 
 @contextmanager
-def flying(folder: Path, *sets: str, config: str = "desk") -> Iterator[Flying]:
+def flying(folder: Path, *sets: str, config: str = "desk", arguments: Sequence[str] = ()) -> Iterator[Flying]:
     """A flight with a folder for its log, the only one of this machine."""
-    with alone(), Flying(folder, *sets, config=config) as flight:
+    with alone(), Flying(folder, *sets, config=config, arguments=arguments) as flight:
         yield flight
