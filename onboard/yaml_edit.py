@@ -6,6 +6,7 @@ import codecs
 import os
 import tempfile
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from io import StringIO
 from pathlib import Path
 from types import TracebackType
@@ -232,7 +233,10 @@ class Candidate:
         try:
             with self.path.open("wb") as file:
                 file.write(text.encode(encoding))
-                os.fchmod(file.fileno(), self._target.stat().st_mode & 0o7777)
+                was = self._target.stat()
+                with suppress(PermissionError):  # only root may give a file away
+                    os.fchown(file.fileno(), was.st_uid, was.st_gid)
+                os.fchmod(file.fileno(), was.st_mode & 0o7777)
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
