@@ -6,22 +6,58 @@ import codecs
 import os
 import tempfile
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from io import StringIO
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.constructor import RoundTripConstructor
 from ruamel.yaml.error import CommentMark
+from ruamel.yaml.nodes import ScalarNode
+from ruamel.yaml.representer import RoundTripRepresenter
 from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 from ruamel.yaml.tokens import CommentToken
 from ruamel.yaml.util import load_yaml_guess_indent
 
 from onboard.layers import ConfigError, Key, dump_text
 
+_TAG: Final = "tag:yaml.org,2002:"
+_KINDS: Final = {int: "int", float: "float", bool: "bool", type(None): "null"}
 #: Longer than any line: what stands on one line stays on one.
-_ENDLESS = 1_000_000
+_ENDLESS: Final = 1_000_000
+
+
+class _Written:
+    """A number, truth value or null as its text: the library would write many a float with other digits."""
+
+    def __init__(self, tag: str, text: str) -> None:
+        self.tag, self.text = tag, text
+
+    def __str__(self) -> str:
+        return self.text
+
+
+class _Constructor(RoundTripConstructor):
+    """Leaves the text of such values as it stands."""
+
+    def keep(self, node: ScalarNode) -> _Written:
+        return _Written(str(node.tag), node.value)
+
+
+class _Representer(RoundTripRepresenter):
+    """Writes that text."""
+
+    def written(self, value: _Written) -> ScalarNode:
+        node: ScalarNode = self.represent_scalar(value.tag, value.text)
+        return node
+
+
+for _name in ("int", "float", "bool", "null", "timestamp"):
+    _Constructor.add_constructor(f"{_TAG}{_name}", _Constructor.keep)
+_Representer.add_representer(_Written, _Representer.written)
 
 
 def edited(text: str, values: Iterable[tuple[Key, Any]]) -> str:
@@ -32,6 +68,7 @@ def edited(text: str, values: Iterable[tuple[Key, Any]]) -> str:
     a path into a list that is not there is an error (KeyError), since the rest of the list is not known here.
     """
     yaml = YAML()
+    yaml.Constructor, yaml.Representer = _Constructor, _Representer
     yaml.preserve_quotes = True
     yaml.width = _ENDLESS
     yaml.allow_duplicate_keys = False
@@ -68,6 +105,8 @@ def _key(at: Any, part: str) -> Any:
         if not part.isdecimal() or int(part) >= len(at):
             raise KeyError(part)
         return int(part)
+    if not isinstance(at, CommentedMap):
+        raise KeyError(part)
     return next((known for known in at if str(known) == part), _new_key(part))
 
 
@@ -149,11 +188,12 @@ def _laid_out(value: Any, old: Any, in_mapping: bool) -> Any:
         if not any(isinstance(item, CommentedMap | CommentedSeq) for item in items) or not in_mapping:
             items.fa.set_flow_style()
         return items
-    if isinstance(value, str):
-        quoted = type(old) if isinstance(old, str) and type(old) is not str else None
-        plain = dump_text({"value": value}) == f"value: {value}\n"
-        return quoted(value) if quoted is not None else value if plain else DoubleQuotedScalarString(value)
-    return value
+    text = dump_text({"value": value}).removeprefix("value: ").removesuffix("\n")
+    if not isinstance(value, str):
+        return _Written(f"{_TAG}{_KINDS[type(value)]}", text)
+    if isinstance(old, str) and type(old) is not str:  # in its own quotes
+        return type(old)(value)
+    return value if text == value else DoubleQuotedScalarString(value)
 
 
 class Candidate:
@@ -193,7 +233,10 @@ class Candidate:
         try:
             with self.path.open("wb") as file:
                 file.write(text.encode(encoding))
-                os.fchmod(file.fileno(), self._target.stat().st_mode & 0o7777)
+                was = self._target.stat()
+                with suppress(PermissionError):  # only root may give a file away
+                    os.fchown(file.fileno(), was.st_uid, was.st_gid)
+                os.fchmod(file.fileno(), was.st_mode & 0o7777)
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
