@@ -11,6 +11,8 @@ Nothing is ever overwritten but the roster, which is replaced as a whole. Privat
 from __future__ import annotations
 
 import os
+import re
+import secrets
 import tempfile
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
@@ -61,7 +63,9 @@ class Authority:
         if folder.is_dir() and any(folder.iterdir()):
             raise KeysError(f"{folder}: is not empty, and nothing is overwritten; give a new folder")
         key = ec.generate_private_key(ec.SECP256R1())
-        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Pipewright authority")])
+        # Two authorities of one name would be told apart by a broken signature only.
+        title = f"Pipewright authority {secrets.token_hex(4)}"
+        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, title)])
         usage = _key_usage(authority=True)
         builder = _builder(name, name, key.public_key(), now, CA_DAYS)
         builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
@@ -235,7 +239,7 @@ def _general_name(host: str) -> x509.GeneralName:
 
 
 def _is_label(label: str) -> bool:
-    return 0 < len(label) <= 63 and label.isascii() and label.replace("-", "a").isalnum() and label.strip("-") == label
+    return re.fullmatch(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?", label) is not None
 
 
 def _private(key: ec.EllipticCurvePrivateKey) -> bytes:

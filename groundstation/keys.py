@@ -55,9 +55,7 @@ def add_parser(commands: Any) -> None:
     )
     add.add_argument("--days", type=int, metavar="N", help="how long it is valid (default: two years)")
     add.add_argument("--renew", action="store_true", help="for a name that has one already")
-    add.add_argument(
-        "--out", type=Path, metavar="DIR", help="new folder for them (default: NAME in the authority)"
-    )
+    add.add_argument("--out", type=Path, metavar="DIR", help="new folder for them (default: NAME in the authority)")
     words = "admit a person or machine no more, for good"
     revoke = what.add_parser("revoke", help=words, description=words.capitalize() + ".")
     revoke.add_argument("name", metavar="NAME")
