@@ -160,9 +160,7 @@ class Authority:
         member = self._known(name) if renew else self.roster.member(name)
         if member is not None and member.revoked is not None:
             # Vehicles tell people apart by name alone: with the name, the revoked certificate would be admitted again.
-            raise KeysError(
-                f"{name}: was revoked on {member.revoked:%Y-%m-%d}, and a revoked name is never given again"
-            )
+            raise KeysError(f"{name}: was revoked on {member.revoked:%Y-%m-%d}; a revoked name is never given again")
         if member is not None and not renew:
             raise KeysError(
                 f"{name}: has a certificate ({member.role.value}, until {member.expires:%Y-%m-%d}); "

@@ -22,20 +22,21 @@ _PUBLISHED = ("pulse", "telemetry", "event")
 _WAYS = {Role.VIEWER: ("safety", "view"), Role.OPERATOR: ("safety", "view", "command")}
 
 
-def vehicle_security(identity: Identity, roster: Roster) -> Security:
-    """Mutual TLS and access control for the session of a vehicle, which listens.
+def vehicle_security(vehicle: str, identity: Identity, roster: Roster) -> Security:
+    """Mutual TLS and access control for the session of ``vehicle``, which listens.
 
     Who is not on the roster, or revoked on it, is connected and sees nothing. Zenoh reads this when the session is
-    opened; another roster takes another session. Raises IdentityError for an identity that is none of a vehicle.
+    opened; another roster takes another session. Raises IdentityError for an identity that is not this vehicle's.
     """
     if identity.role is not Role.VEHICLE:
         raise IdentityError(f"{identity.certificate}: is of {identity.name}, {identity.role}; give a vehicle's folder")
-    root = f"pipewright/{identity.name}"
+    if identity.name != vehicle:
+        # Stations would take it for another, and hear nothing.
+        raise IdentityError(f"{identity.certificate}: is of {identity.name}, but this is {vehicle}; make both the same")
+    root = f"pipewright/{vehicle}"
     everyone = [*roster.admitted(Role.VIEWER), *roster.admitted(Role.OPERATOR)]
     published = [f"{root}/{what}" for what in _PUBLISHED]
     access = _Access()
-    # Zenoh enforces nothing while there is no rule at all, as with an empty roster.
-    access.allow("itself", [identity.name], "egress", ["liveliness_token"], [f"{root}/alive"])
     access.allow("subscribe", everyone, "ingress", ["declare_subscriber"], published)
     access.allow("publish", everyone, "egress", ["put"], published)
     access.allow("watch", everyone, "ingress", ["liveliness_query", "declare_liveliness_subscriber"], [f"{root}/alive"])

@@ -108,8 +108,11 @@ def _as_far_as_it_goes(step: Callable[[], None]) -> None:
 
 
 def _remedy(error: ssl.SSLCertVerificationError) -> str:
-    if error.verify_code == 10:
-        return "; have a new one made: pipewright keys add NAME --role ROLE --renew"
-    if error.verify_code == 9:
-        return f"; is the clock of this machine right? It says {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
-    return "; both must come from the same authority"
+    match error.verify_code:
+        case 9:
+            return f"; is the clock of this machine right? It says {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+        case 10:
+            return "; have a new one made: pipewright keys add NAME --role ROLE --renew"
+        case 18 | 19 | 20 | 21:
+            return "; both must come from the same authority"
+    return "; make one with: pipewright keys add"

@@ -102,7 +102,7 @@ def endpoint() -> str:
 
 @pytest.fixture
 def vehicle(fleet: Fleet, endpoint: str) -> Iterator[VehicleEnd]:
-    with VehicleEnd(endpoint, vehicle_security(fleet["falcon"], fleet.authority.roster)) as end:
+    with VehicleEnd(endpoint, vehicle_security("falcon", fleet["falcon"], fleet.authority.roster)) as end:
         yield end
 
 
@@ -179,13 +179,15 @@ def test_another_vehicle_is_no_station(fleet: Fleet, vehicle: VehicleEnd, endpoi
 
 def test_who_is_not_on_the_roster_gets_nothing(fleet: Fleet, endpoint: str) -> None:
     everyone = fleet.authority.roster.members
-    security = vehicle_security(fleet["falcon"], Roster(members=tuple(m for m in everyone if m.name != "alice")))
+    security = vehicle_security(
+        "falcon", fleet["falcon"], Roster(members=tuple(m for m in everyone if m.name != "alice"))
+    )
     with VehicleEnd(endpoint, security) as vehicle, station(fleet, "alice", endpoint) as alice:
         gets_nothing(vehicle, alice)
 
 
 def test_an_empty_roster_admits_nobody(fleet: Fleet, endpoint: str) -> None:
-    security = vehicle_security(fleet["falcon"], Roster())
+    security = vehicle_security("falcon", fleet["falcon"], Roster())
     with VehicleEnd(endpoint, security) as vehicle, station(fleet, "alice", endpoint) as alice:
         gets_nothing(vehicle, alice)
 
@@ -193,14 +195,16 @@ def test_an_empty_roster_admits_nobody(fleet: Fleet, endpoint: str) -> None:
 def test_the_revoked_is_out_and_the_others_come_back(tmp_path: Path, endpoint: str) -> None:
     fleet = Fleet(tmp_path / "authority", falcon=Role.VEHICLE, alice=Role.OPERATOR, carol=Role.OPERATOR)
     with ExitStack() as stack:
-        before = VehicleEnd(endpoint, vehicle_security(fleet["falcon"], fleet.authority.roster))
+        before = VehicleEnd(endpoint, vehicle_security("falcon", fleet["falcon"], fleet.authority.roster))
         with before:
             alice = stack.enter_context(station(fleet, "alice", endpoint))
             carol = stack.enter_context(station(fleet, "carol", endpoint))
             assert alice.asks("command")
             assert carol.asks("command")
         fleet.authority.revoke("carol")
-        after = stack.enter_context(VehicleEnd(endpoint, vehicle_security(fleet["falcon"], fleet.authority.roster)))
+        after = stack.enter_context(
+            VehicleEnd(endpoint, vehicle_security("falcon", fleet["falcon"], fleet.authority.roster))
+        )
         wait_until(lambda: after.connected() == {"alice", "carol"}, "both have connected again")
         wait_until(alice.sees_vehicle, "alice sees the vehicle again")
         assert alice.asks("command")
@@ -246,21 +250,23 @@ def test_a_plain_client_sees_nothing(vehicle: VehicleEnd, endpoint: str) -> None
 
 
 def test_a_station_hears_no_other_vehicle_that_poses_as_the_one_it_means(fleet: Fleet, endpoint: str) -> None:
-    posing = vehicle_security(replace(fleet["eagle"], name="falcon"), fleet.authority.roster)
+    posing = vehicle_security("falcon", replace(fleet["eagle"], name="falcon"), fleet.authority.roster)
     with VehicleEnd(endpoint, posing) as eagle, station(fleet, "alice", endpoint) as alice:
         assert eagle.connected() == {"alice"}
         gets_nothing(eagle, alice)
 
 
 def test_a_station_cannot_listen_as_a_vehicle(fleet: Fleet, endpoint: str) -> None:
-    posing = vehicle_security(replace(fleet["victor"], name="falcon", role=Role.VEHICLE), fleet.authority.roster)
+    posing = vehicle_security(
+        "falcon", replace(fleet["victor"], name="falcon", role=Role.VEHICLE), fleet.authority.roster
+    )
     with opened("router", endpoint, posing), pytest.raises(zenoh.ZError):
         opened("client", endpoint, station_security("falcon", fleet["alice"]))
 
 
 def test_a_vehicle_is_connected_to_by_its_names_only(fleet: Fleet) -> None:
     endpoint = f"tls/127.0.0.2:{free_port()}"
-    security = vehicle_security(fleet["falcon"], fleet.authority.roster)
+    security = vehicle_security("falcon", fleet["falcon"], fleet.authority.roster)
     with opened("router", endpoint, security), pytest.raises(zenoh.ZError):
         opened("client", endpoint, station_security("falcon", fleet["alice"]))
 
@@ -273,10 +279,15 @@ def test_a_station_that_means_another_vehicle_sees_nothing(fleet: Fleet, vehicle
 @pytest.mark.parametrize("name", ["alice", "victor"])
 def test_a_vehicle_takes_no_certificate_of_a_station(fleet: Fleet, name: str) -> None:
     with pytest.raises(IdentityError, match=rf"{name}/cert.pem: is of {name}, \w+; give a vehicle's folder"):
-        vehicle_security(fleet[name], fleet.authority.roster)
+        vehicle_security(name, fleet[name], fleet.authority.roster)
 
 
 def test_a_station_takes_no_certificate_of_a_vehicle(fleet: Fleet) -> None:
     falcon: Identity = fleet["falcon"]
     with pytest.raises(IdentityError, match=r"is a vehicle's; give the folder of an operator or a viewer"):
         station_security("falcon", falcon)
+
+
+def test_a_vehicle_has_the_name_of_its_certificate(fleet: Fleet) -> None:
+    with pytest.raises(IdentityError, match=r"eagle/cert.pem: is of eagle, but this is falcon; make both the same"):
+        vehicle_security("falcon", fleet["eagle"], fleet.authority.roster)
