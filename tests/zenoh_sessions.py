@@ -7,6 +7,7 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import zenoh
@@ -46,10 +47,10 @@ def opened(mode: str, endpoint: str, security: Security) -> zenoh.Session:
 
 def wait_until(condition: Callable[[], Any], what: str) -> None:
     """Wait for something that other threads bring about."""
-    until = time.monotonic() + LONG
+    until, pause = time.monotonic() + LONG, Event()
     while not condition():
         assert time.monotonic() < until, f"not within {LONG} s: {what}"
-        time.sleep(0.005)
+        pause.wait(0.005)
 
 
 class Fleet:
