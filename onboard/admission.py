@@ -72,6 +72,13 @@ def station_security(vehicle: str, identity: Identity) -> Security:
     return {**_mutual_tls(identity), "access_control": access.settings()}
 
 
+def not_for(identity: Identity, way: str) -> str:
+    """Why a station need not ask on this way; empty: it may. The vehicle would say nothing."""
+    if way in _WAYS.get(identity.role, ()):
+        return ""
+    return f"{identity.name} is a {identity.role}: for this an operator's certificate is needed"
+
+
 def _mutual_tls(identity: Identity) -> Security:
     certificate, key = str(identity.certificate.resolve()), str(identity.key.resolve())
     return {

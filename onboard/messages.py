@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from onboard.admission import station_security
+from onboard.admission import not_for, station_security
 from onboard.core.repair import Pipe, Repair
 from onboard.core.types import Event, Phase, Severity, Tick
 from onboard.identity import Identity, IdentityError, load_identity
@@ -56,5 +56,6 @@ __all__ = [
     "is_name",
     "load_identity",
     "load_roster",
+    "not_for",
     "station_security",
 ]

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from onboard.admission import Security, station_security, vehicle_security
+from onboard.admission import Security, not_for, station_security, vehicle_security
 from onboard.identity import Identity, IdentityError
 from onboard.roster import Role, Roster
 from tests.zenoh_sessions import Fleet, free_port, opened, wait_until
@@ -126,7 +126,7 @@ def test_an_operator_hears_and_asks_everything_under_the_own_name(
 ) -> None:
     with station(fleet, "alice", endpoint) as alice:
         assert alice.sees_vehicle()
-        assert all(alice.asks(way) for way in WAYS)
+        assert all(alice.asks(way) and not not_for(fleet["alice"], way) for way in WAYS)
         alice.session.put(f"{ROOT}/station/alice/1/pulse", b"")
         wait_until(lambda: vehicle.pulses == [f"{ROOT}/station/alice/1/pulse"], "the pulse")
         wait_until(lambda: vehicle.stations() == {"alice"}, "the token")
@@ -141,6 +141,9 @@ def test_a_viewer_hears_everything_and_asks_for_stop_retreat_and_kill(
     with station(fleet, "victor", endpoint) as victor:
         assert victor.sees_vehicle()
         assert [way for way in WAYS if victor.asks(way)] == ["safety", "view"]
+        assert [way for way in WAYS if not not_for(fleet["victor"], way)] == ["safety", "view"]
+        needed = "victor is a viewer: for this an operator's certificate is needed"
+        assert not_for(fleet["victor"], "command") == needed
         vehicle.publish("ack/victor")
         wait_until(lambda: victor.heard == {*PUBLISHED, "ack/victor"}, "what is published")
         assert vehicle.asked == [f"{ROOT}/station/victor/1/{way}" for way in ("safety", "view")]
