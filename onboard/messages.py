@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from onboard.admission import not_for, station_security
 from onboard.core.repair import Pipe, Repair
 from onboard.core.types import Event, Phase, Severity, Tick
+from onboard.identity import Identity, IdentityError, load_identity
 from onboard.logfile import LogError, LogReader
 from onboard.records import (
     DEVICES,
@@ -19,28 +21,41 @@ from onboard.records import (
     RunInfo,
     Timing,
 )
+from onboard.roster import NAME_RULE, Member, Role, Roster, RosterError, is_name, load_roster
 from sim_backend.plant import Truth
 
 __all__ = [
     "DEVICES",
     "EVENT",
     "KEYFRAME",
+    "NAME_RULE",
     "PARAMS",
     "TICK",
     "TIMING",
     "TRUTH",
     "DeviceReport",
     "Event",
+    "Identity",
+    "IdentityError",
     "Keyframe",
     "LogError",
     "LogReader",
+    "Member",
     "Phase",
     "Pipe",
     "Repair",
     "Revision",
+    "Role",
+    "Roster",
+    "RosterError",
     "RunInfo",
     "Severity",
     "Tick",
     "Timing",
     "Truth",
+    "is_name",
+    "load_identity",
+    "load_roster",
+    "not_for",
+    "station_security",
 ]

@@ -1,0 +1,82 @@
+"""Who is admitted to a vehicle, by the names in their certificates."""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+from msgspec import Struct
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
+NAME_RULE = "it takes small letters, digits, - and _, 32 at most, a letter or a digit first"
+
+
+def is_name(text: str) -> bool:
+    """Whether a text may name a person or a machine: it goes into certificates, keys of the link and file names."""
+    return _NAME.fullmatch(text) is not None
+
+
+class Role(StrEnum):
+    """What a certificate is for."""
+
+    VIEWER = "viewer"
+    """Sees everything, asks for nothing but stop, retreat and kill."""
+    OPERATOR = "operator"
+    """May ask for everything."""
+    VEHICLE = "vehicle"
+    """Is a vehicle: publishes and answers under its own name only."""
+
+
+class Member(Struct, frozen=True, forbid_unknown_fields=True):
+    """One person or machine."""
+
+    name: str
+    """The common name of its certificates."""
+    role: Role
+    expires: datetime
+    """When its newest certificate does (UTC)."""
+    revoked: datetime | None = None
+    """Since when it is admitted no more (UTC)."""
+
+
+class Roster(Struct, frozen=True, forbid_unknown_fields=True):
+    """All who were ever given a certificate. A name stands for one person or machine, for good."""
+
+    version: Literal[1] = 1
+    members: tuple[Member, ...] = ()
+
+    def __post_init__(self) -> None:
+        """A name that is doubtful is refused, since access is by name."""
+        names = [member.name for member in self.members]
+        if wrong := [name for name in names if not is_name(name)]:
+            raise ValueError(f"{wrong[0]!r} is no name; {NAME_RULE}")
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"{twice[0]} is there twice")
+
+    def member(self, name: str) -> Member | None:
+        """The one of this name."""
+        return next((member for member in self.members if member.name == name), None)
+
+    def admitted(self, role: Role) -> tuple[str, ...]:
+        """The names in a role that are not revoked."""
+        return tuple(m.name for m in self.members if m.role is role and m.revoked is None)
+
+
+class RosterError(Exception):
+    """A roster cannot be read; the text says where and why."""
+
+
+def load_roster(path: Path) -> Roster:
+    """Read ``roster.json``. Raises RosterError."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Roster)
+    except OSError as error:
+        raise RosterError(
+            f"{path}: {error.strerror}; `pipewright keys` writes it into the authority's folder"
+        ) from None
+    except msgspec.DecodeError as error:
+        raise RosterError(f"{path}: {error}; copy it again from the folder of the authority") from None
