@@ -173,8 +173,13 @@ class Client:
 
     def wait(self, until: Callable[[Contact], bool], timeout: float) -> bool:
         """Wait until the contact is as wanted, at most ``timeout`` seconds; whether it is."""
+        end = time.monotonic() + timeout
         with self._changed:
-            return self._changed.wait_for(lambda: until(self._contact()), timeout)
+            while not until(self._contact()):
+                if (left := end - time.monotonic()) <= 0.0:
+                    return False
+                self._changed.wait(min(left, _PULSE_PERIOD))  # ages grow without a word
+        return True
 
     def telemetry(self) -> Telemetry | None:
         """The newest tick that has come."""

@@ -21,6 +21,7 @@ _ENDPOINT: Final = re.compile(r"(tcp|tls)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]+):([
 _COMMON: Final[ZenohConfig] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
+    "open/return_conditions/connect_scouted": False,
     "adminspace/enabled": False,
     "transport/shared_memory/enabled": False,
     "connect/exit_on_failure": True,

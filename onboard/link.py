@@ -27,7 +27,7 @@ from onboard.endpoints import ZenohConfig, open_session
 from onboard.lease import Lease, Watch
 from onboard.link_settings import LinkSettings
 from onboard.outbox import Outbox
-from onboard.sessions import Answers, Sessions
+from onboard.sessions import MOST, Answers, Sessions
 from onboard.wire import (
     LARGEST,
     Ack,
@@ -115,6 +115,9 @@ class Link:
         self._notices = Notices()
         self._teller = Teller(self._notices, time.monotonic_ns)
         self._closing = Flag()
+        self._events = Outbox("link.events", _EVENTS, self._failed)
+        self._answers = Outbox("link.answers", _ANSWERS, self._failed)
+        self._sender = Thread(target=self._send, name="link.telemetry", daemon=True)
         self._session: zenoh.Session | None = None
 
     def start(self) -> None:
@@ -129,16 +132,14 @@ class Link:
             more=_limits(keys),
         )
         self._publish = partial(_put, session)
-        self._events = Outbox("link.events", _EVENTS, self._failed)
-        self._answers = Outbox("link.answers", _ANSWERS, self._failed)
-        self._sender = Thread(target=self._send, name="link.telemetry", daemon=True)
+        for thread in (self._events, self._answers, self._sender):
+            thread.start()
         for way in Way:
             session.declare_queryable(keys.stations(way), partial(self._hear_order, way))
         session.declare_subscriber(keys.stations("pulse"), self._hear_pulse)
         alive = session.liveliness()
         alive.declare_subscriber(keys.stations("alive"), self._hear_alive, history=True)
         self._token = alive.declare_token(keys.alive)
-        self._sender.start()
 
     def stop(self) -> None:
         """Send what waits, for a moment at most, and close; safe to call twice."""
@@ -352,6 +353,8 @@ def _credible(stamp_ns: int, now: int) -> int:
 def _limits(keys: Keys) -> ZenohConfig:
     rules = [{"key_expr": keys.stations(what), "freq": rate} for what, rate in _RATES.items()]
     return {
+        "transport/link/rx/max_message_size": 1 << 20,
+        "transport/unicast/max_sessions": 2 * MOST,
         "downsampling": [{"flows": ["ingress"], "messages": ["put", "query"], "rules": rules}],
         "low_pass_filter": [
             {

@@ -34,7 +34,7 @@ _REFUSAL: Final = b"pipewright: "
 #: Of a message that a station sends, bytes.
 LARGEST: Final = 16 * 1024
 #: Names of vehicles, stations and sessions.
-NAME: Final = r"^[a-z0-9][a-z0-9_-]{0,31}$"
+NAME: Final = r"^[a-z0-9][a-z0-9_-]{0,31}\Z"
 
 Text = Annotated[str, Meta(max_length=1000)]
 Name = Annotated[str, Meta(pattern=NAME)]
@@ -245,7 +245,7 @@ class Reader(Generic[T]):
             raise WireError(f"message of version {version}, but here version {VERSION} is spoken: update {older}")
         try:
             return self._decode(memoryview(payload)[len(_MARK) + 1 :])
-        except (msgspec.DecodeError, RecursionError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise WireError(f"not a valid {self._name}: {error}") from None
 
 
