@@ -21,7 +21,7 @@ _ENDPOINT: Final = re.compile(r"(tcp|tls)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]+):([
 _COMMON: Final[ZenohConfig] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
-    "open/return_conditions/connect_scouted": False,
+    "scouting/delay": 0,  # nobody is to be discovered
     "adminspace/enabled": False,
     "transport/shared_memory/enabled": False,
     "connect/exit_on_failure": True,
@@ -85,12 +85,12 @@ def open_session(
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        if mode == "client":
-            where = ", ".join(endpoints)
+        where = ", ".join(endpoints)
+        if "Unable to connect" in str(error):
             raise NoVehicleError(f"nothing lets us in at {where} within {timeout:g} s: is the vehicle on?") from None
         # Zenoh appends where in its sources it happened.
         reason = re.sub(r" at \S+\.rs:\d+\.?|\[|\]", "", str(error))
-        raise LinkError(f"{', '.join(endpoints)}: {reason}") from None
+        raise LinkError(f"{where}: {reason}") from None
 
 
 def _loopback(host: str) -> bool:

@@ -91,12 +91,12 @@ class Watch:
             if before is None:
                 self._lost = lease
                 how = f"silent for {silent_ns * 1e-9:.1f} s" if present else "gone"
-                return True, f"The commanding station {lease.holder} is {how}."
+                return True, f"the commanding station {lease.holder} is {how}."
         elif before is not None:
             self._lost = None
             silent = (lease.heard_ns - before.heard_ns) * 1e-9
             return (
                 False,
-                f"The commanding station {lease.holder} is back after {silent:.1f} s. Nothing resumes by itself.",
+                f"the commanding station {lease.holder} is back after {silent:.1f} s. Nothing resumes by itself.",
             )
         return False, ""

@@ -113,7 +113,7 @@ class Link:
         self._numbers = itertools.count(1)
         self._told = 0
         self._notices = Notices()
-        self._teller = Teller(self._notices, time.monotonic_ns)
+        self._teller = Teller(self._notices, time.monotonic_ns, "link")
         self._closing = Flag()
         self._events = Outbox("link.events", _EVENTS, self._failed)
         self._answers = Outbox("link.answers", _ANSWERS, self._failed)
@@ -192,7 +192,7 @@ class Link:
         except WireError as error:
             answer = partial(query.reply_err, refusal(str(error)))
         except Exception as error:  # a fault in carrying out an order is told to both sides
-            self._teller.once("fault", Level.ERROR, f"An order has failed: {type(error).__name__}: {error}")
+            self._teller.once("fault", Level.ERROR, f"an order has failed: {type(error).__name__}: {error}")
             answer = partial(query.reply_err, refusal(f"failed on the vehicle: {type(error).__name__}: {error}"))
 
         def send() -> None:
@@ -246,7 +246,7 @@ class Link:
             place = self._keys.place(str(sample.key_expr))
             pulse = read_station_pulse(sample.payload.to_bytes())
         except WireError as error:
-            self._teller.once("pulse", Level.WARNING, f"A station's sign of life is not understood: {error}")
+            self._teller.once("pulse", Level.WARNING, f"a station's sign of life is not understood: {error}")
             return
         now = time.monotonic_ns()
         with self._lock:
@@ -258,7 +258,7 @@ class Link:
         try:
             place = self._keys.place(str(sample.key_expr))
         except WireError as error:
-            self._teller.once("alive", Level.WARNING, f"A station is not understood: {error}")
+            self._teller.once("alive", Level.WARNING, f"a station is not understood: {error}")
             return
         kept = True
         with self._lock:
@@ -272,7 +272,7 @@ class Link:
     def _room(self, kept: bool, place: Place) -> None:
         if not kept:
             self._teller.once(
-                "room", Level.WARNING, f"Too many sessions of stations: {place.station} is not kept track of."
+                "room", Level.WARNING, f"too many sessions of stations: {place.station} is not kept track of."
             )
 
     def _hold(self, lease: Lease) -> None:
@@ -321,7 +321,7 @@ class Link:
 
     def _failed(self, error: Exception) -> None:
         if not self._closing.is_set():
-            self._teller.once("send", Level.ERROR, f"The link cannot send: {type(error).__name__}: {error}")
+            self._teller.once("send", Level.ERROR, f"nothing can be sent: {type(error).__name__}: {error}")
 
 
 #: How Zenoh treats what is sent: signs of life before all else, telemetry after all else, events never dropped by it.

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from onboard.endpoints import LinkError, open_session, unfit
+from tests.onboard.relay import free_port
 
 
 def one(endpoint: str, *, plain: bool = True, secured: bool = False) -> str:
@@ -47,3 +50,9 @@ def test_all_errors_at_once_and_nothing_is_opened() -> None:
 def test_no_endpoint_at_all() -> None:
     with pytest.raises(LinkError, match="the link has no endpoint"):
         open_session("client", [], plain=True, lease=0.6, security={})
+
+
+def test_what_zenoh_itself_refuses() -> None:
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    with pytest.raises(LinkError, match=rf"{re.escape(endpoint)}: .*Missing TLS private key\.$"):
+        open_session("router", [endpoint], plain=False, lease=0.6, security={"transport/link/tls": {}})

@@ -120,20 +120,20 @@ def test_watch_tells_loss_and_return_once_each() -> None:
     assert watch.look(ALICE, present=True, t_ns=101 * S) == (False, "")
     assert watch.look(ALICE, present=True, t_ns=102 * S) == (
         True,
-        "The commanding station alice is silent for 2.0 s.",
+        "the commanding station alice is silent for 2.0 s.",
     )
     assert watch.look(ALICE, present=True, t_ns=103 * S) == (False, "")
     back = Lease("alice", 105 * S)
     assert watch.look(back, present=True, t_ns=105 * S) == (
         False,
-        "The commanding station alice is back after 5.0 s. Nothing resumes by itself.",
+        "the commanding station alice is back after 5.0 s. Nothing resumes by itself.",
     )
     assert watch.look(back, present=True, t_ns=105 * S) == (False, "")
 
 
 def test_watch_tells_one_that_is_gone_before_it_was_silent() -> None:
     watch = Watch(S)
-    assert watch.look(ALICE, present=False, t_ns=100 * S) == (True, "The commanding station alice is gone.")
+    assert watch.look(ALICE, present=False, t_ns=100 * S) == (True, "the commanding station alice is gone.")
 
 
 def test_watch_says_nothing_of_nobody_nor_of_one_that_was_replaced() -> None:

@@ -16,9 +16,13 @@ from msgspec.structs import replace
 from drivers.mailbox import Level
 from groundstation.client import Client, NoAnswerError, StationSettings
 from onboard.core.types import Event, Phase, Request, Severity, Tick
+from onboard.declared import describe
 from onboard.endpoints import LinkError, NoVehicleError, open_session
+from onboard.layers import ConfigError
 from onboard.link import Asked, Link
 from onboard.link_settings import LinkSettings
+from onboard.params import load
+from onboard.sessions import MOST_OF_ONE
 from onboard.wire import (
     Ack,
     Arm,
@@ -30,6 +34,7 @@ from onboard.wire import (
     Outcome,
     ReleaseLease,
     ShowParams,
+    StationPulse,
     Stop,
     TakeLease,
     Telemetry,
@@ -276,8 +281,8 @@ def test_command_is_taken_seized_and_released(vehicle: Vehicle, join: Callable[.
     assert vehicle.link.state().commander == "bob"
     assert alice.ask(HOLD).outcome is Outcome.REFUSED
     assert vehicle.says("alice commands.")
-    assert (Level.INFO, "alice commands.") in vehicle.told
-    assert (Level.WARNING, "bob has seized command from alice.") in vehicle.told
+    assert (Level.INFO, "link: alice commands.") in vehicle.told
+    assert (Level.WARNING, "link: bob has seized command from alice.") in vehicle.told
     vehicle.link.tick(FLYING)
     assert bob.ask(ReleaseLease()).text == "The vehicle flies: land first, or let another station seize command."
     vehicle.link.tick(ON_GROUND)
@@ -385,7 +390,7 @@ def test_what_cannot_be_understood_is_refused_in_words_and_the_next_is_served(ve
         everybody = Keys("x500").station("raw", "s1", Way.SAFETY).replace("raw", "*")
         assert "'*' is no name of a station" in str(query_key(session, everybody, order))
         session.put(Keys("x500").station("raw", "s1", "pulse"), b"nonsense")
-        seconds_until(lambda: vehicle.says("A station's sign of life is not understood: not a message"))
+        seconds_until(lambda: vehicle.says("a station's sign of life is not understood: not a message"))
         assert query(session, Way.SAFETY, order) == Ack("1", Outcome.DONE, "so be it")
     assert len(vehicle.asked) == 1
 
@@ -398,7 +403,7 @@ def test_a_fault_in_carrying_out_is_told_to_both_sides(vehicle: Vehicle, join: C
     vehicle.answer = fail
     answer = alice.ask(Stop())
     assert (answer.outcome, answer.text) == (Outcome.REFUSED, "failed on the vehicle: KeyError: 'left'")
-    assert vehicle.says("An order has failed: KeyError: 'left'")
+    assert vehicle.says("an order has failed: KeyError: 'left'")
     vehicle.answer = lambda asked: asked.done()
     assert alice.ask(Stop()).outcome is Outcome.DONE
 
@@ -455,7 +460,7 @@ def test_a_link_that_is_cut_is_told_and_nothing_is_lost_for_good(vehicle: Vehicl
         seconds_until(lambda: vehicle.link.state().present)
         relay.cut()
         began = time.monotonic()
-        seconds_until(lambda: vehicle.says("The commanding station alice is"))
+        seconds_until(lambda: vehicle.says("the commanding station alice is"))
         seconds_until(lambda: not vehicle.link.state().present)
         assert alice.wait(lambda contact: not contact.present and contact.age > 1.0, LONG)
         seconds_until(lambda: vehicle.heard() > 1.0)
@@ -523,6 +528,26 @@ def test_nothing_is_left_when_both_ends_have_closed(vehicle: Vehicle) -> None:
     assert vehicle.link.dropped == 1
 
 
+def test_a_commander_that_is_connected_but_says_nothing_is_told(vehicle: Vehicle) -> None:
+    with raw(vehicle) as session:
+        token = session.liveliness().declare_token(Keys("x500").station("raw", "s1", "alive"))
+        query(session, Way.COMMAND, encode(Order("1", TakeLease(), time.monotonic_ns())))
+        seconds_until(lambda: vehicle.says("link: the commanding station raw is silent for"))
+        assert vehicle.link.state().present
+        assert vehicle.heard() > vehicle.settings.silence
+        token.undeclare()
+    seconds_until(lambda: not vehicle.link.state().present)
+
+
+def test_a_station_of_too_many_sessions_is_told_and_not_kept_track_of(vehicle: Vehicle) -> None:
+    with raw(vehicle) as session:
+        for i in range(MOST_OF_ONE + 1):
+            session.put(Keys("x500").station("raw", f"s{i}", "pulse"), encode(StationPulse(1)))
+            pause(0.02)  # else the vehicle takes them for a flood
+        seconds_until(lambda: vehicle.says("too many sessions of stations: raw is not kept track of"))
+        assert len(vehicle.link._sessions.heard(time.monotonic_ns())) == MOST_OF_ONE
+
+
 # --- what cannot be ---------------------------------------------------------------------------------------------------
 
 
@@ -570,3 +595,12 @@ def test_a_station_without_a_name_is_called_after_user_and_machine(vehicle: Vehi
     with Client(settings(vehicle, ""), timeout=LONG) as station:
         assert Keys("x500").ack(station.station)
         assert not math.isinf(station.contact().age)
+
+
+def test_settings_are_parameters_as_all_others() -> None:
+    values = {"vehicle": "x600", "listen": ["tls/0.0.0.0:7447"], "telemetry_rate": 10.0}
+    assert load(LinkSettings, values, "here") == LinkSettings("x600", ("tls/0.0.0.0:7447",), telemetry_rate=10.0)
+    with pytest.raises(ConfigError) as caught:
+        load(LinkSettings, {"vehicle": "X 600", "peer_lease": 0.01, "speed": 3}, "here")
+    assert len(caught.value.errors) == 3
+    assert all(parameter.doc and not parameter.in_flight for parameter in describe(LinkSettings))
