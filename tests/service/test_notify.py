@@ -14,9 +14,9 @@ from threading import Thread
 import pytest
 
 from tests.process.flying import PATIENCE, Flying, flying
-from tests.realtime import LONGEST
+from tests.realtime import REALTIME
 
-pytestmark = pytest.mark.timeout(LONGEST)
+pytestmark = REALTIME
 
 #: What systemd allows between two heartbeats, s.
 WATCHDOG = 2.0
