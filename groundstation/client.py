@@ -54,8 +54,8 @@ _SOON: Final = 0.03
 #: One that was accepted is asked after this often, s, should the word of its end have been lost.
 _ASK_AFTER: Final = 1.0
 _PULSE_PERIOD: Final = 0.1
-#: Without a sign of the vehicle's machine, then it is gone, s.
-_PEER_LEASE: Final = 0.6
+#: Without a sign of the other machine, then it is gone, s.
+_PEER_LEASE: Final = 2.0
 #: Round trips of which the shortest is told: the newest.
 _ROUND_TRIPS: Final = 20
 _KEPT_EVENTS: Final = 1000
@@ -85,7 +85,7 @@ class Contact(Struct, frozen=True):
     """How the vehicle is heard."""
 
     present: bool = False
-    """It is connected; it is not while it is closed, frozen, or out of reach."""
+    """It is connected. It is not once it has closed or died, or was frozen or out of reach for two seconds."""
     age: float = math.inf
     """What was last heard of it was certainly sent at most so long ago, s."""
     round_trip: float = math.inf

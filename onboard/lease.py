@@ -71,7 +71,7 @@ def commands(lease: Lease, station: str) -> str:
 
 
 class Watch:
-    """Tells, once each, that the commander is lost and that it is back."""
+    """Tells, once each, that the commander is lost and that it is back: heard as of less than half the silence ago."""
 
     def __init__(self, silence_ns: int) -> None:
         self._silence_ns = silence_ns
@@ -92,7 +92,7 @@ class Watch:
                 self._lost = lease
                 how = f"silent for {silent_ns * 1e-9:.1f} s" if present else "gone"
                 return True, f"the commanding station {lease.holder} is {how}."
-        elif before is not None:
+        elif before is not None and silent_ns < self._silence_ns / 2:
             self._lost = None
             silent = (lease.heard_ns - before.heard_ns) * 1e-9
             return (

@@ -64,7 +64,7 @@ class LinkState(Struct, frozen=True, gc=False):
     heard_ns: int = 0
     """What was last heard of it was certainly sent after this time."""
     present: bool = False
-    """It is connected; it is not while it is closed, frozen, or out of reach for longer than the peer lease."""
+    """It is connected. It is not once it has closed or died, or was frozen or out of reach for the peer lease."""
 
     def age(self, t_ns: int) -> float:
         """Time since the commander was certainly there, s; 0 when nobody commands."""

@@ -28,8 +28,10 @@ class LinkSettings(Struct, frozen=True, forbid_unknown_fields=True):
     plain: Annotated[bool, _note("allow endpoints without TLS, on loopback only")] = False
     telemetry_rate: Annotated[float, _meta("Hz", 0.1, 100.0, "at which the newest tick is sent")] = 20.0
     pulse_period: Annotated[float, _meta("s", 0.02, 1.0, "between two signs of life")] = 0.1
-    peer_lease: Annotated[float, _meta("s", 0.2, 10.0, "without a sign of a station's machine, then it is gone")] = 0.6
-    silence: Annotated[float, _meta("s", 0.2, 60.0, "of the commander, then this is told")] = 1.0
+    peer_lease: Annotated[
+        float, _meta("s", 0.2, 10.0, "without a sign of the other machine, then it is gone; more than its round trip")
+    ] = 2.0
+    silence: Annotated[float, _meta("s", 0.2, 60.0, "of the commander, then this is told")] = 0.8
     patience: Annotated[float, _meta("s", 1.0, 600.0, "of a silent commander, then anyone may take the lease")] = 10.0
     order_age: Annotated[
         float, _meta("s", 0.2, 60.0, "an order that may have travelled longer is refused; not so stop, retreat, kill")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import select
 import socket
+import time
+from collections import deque
 from threading import Event, Thread
 from types import TracebackType
 from typing import Self
@@ -18,10 +20,14 @@ def free_port() -> int:
 
 
 class Relay:
-    """Carries TCP connections from ``port`` to another port of loopback. Use as a context manager."""
+    """Carries TCP connections from ``port`` to another port of loopback, ``delay`` seconds late each way.
 
-    def __init__(self, to: int) -> None:
-        self._to = to
+    Use as a context manager.
+    """
+
+    def __init__(self, to: int, delay: float = 0.0) -> None:
+        self._to, self._delay = to, delay
+        self._late: deque[tuple[float, socket.socket, bytes]] = deque()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
         self._whole = Event()
@@ -52,14 +58,18 @@ class Relay:
     def _carry(self) -> None:
         while not self._closing.is_set():
             self._whole.wait()
-            ready, _, _ = select.select([self._listener, *self._pairs], [], [], 0.02)
+            ready, _, _ = select.select([self._listener, *self._pairs], [], [], 0.005)
+            if not self._whole.is_set():
+                continue
             for end in ready:
-                if not self._whole.is_set():
-                    break
                 if end is self._listener:
                     self._join()
                 elif end in self._pairs:
-                    self._pass(end)
+                    self._take(end)
+            while self._late and self._late[0][0] <= time.monotonic():
+                _, end, data = self._late.popleft()
+                if end in self._pairs:
+                    self._give(end, data)
         for end in (self._listener, *self._pairs):
             end.close()
 
@@ -72,14 +82,23 @@ class Relay:
             return
         self._pairs |= {near: far, far: near}
 
-    def _pass(self, end: socket.socket) -> None:
-        other = self._pairs[end]
+    def _take(self, end: socket.socket) -> None:
         try:
-            if data := end.recv(65536):
-                other.sendall(data)
-                return
+            data = end.recv(65536)
         except OSError:
-            pass  # an end that breaks off is an end that closes
-        for one in (end, other):
+            data = b""  # an end that breaks off is an end that closes
+        if data:
+            self._late.append((time.monotonic() + self._delay, self._pairs[end], data))
+        else:
+            self._part(end)
+
+    def _give(self, end: socket.socket, data: bytes) -> None:
+        try:
+            end.sendall(data)
+        except OSError:
+            self._part(end)
+
+    def _part(self, end: socket.socket) -> None:
+        for one in (end, self._pairs[end]):
             del self._pairs[one]
             one.close()

@@ -123,6 +123,8 @@ def test_watch_tells_loss_and_return_once_each() -> None:
         "the commanding station alice is silent for 2.0 s.",
     )
     assert watch.look(ALICE, present=True, t_ns=103 * S) == (False, "")
+    slow = Lease("alice", 103 * S + S // 2)
+    assert watch.look(slow, present=True, t_ns=104 * S) == (False, ""), "told neither back nor lost again"
     back = Lease("alice", 105 * S)
     assert watch.look(back, present=True, t_ns=105 * S) == (
         False,

@@ -495,6 +495,21 @@ def test_a_stop_that_is_asked_while_the_link_is_cut_arrives_when_it_is_back(
     assert vehicle.asks() == [Stop()]
 
 
+def test_what_comes_steadily_but_late_is_known_to_be_old(vehicle: Vehicle, join: Callable[..., Client]) -> None:
+    late = 0.4
+    with Relay(int(vehicle.settings.listen[0].rpartition(":")[2]), late) as relay:
+        alice = join("alice", relay.port)
+        assert alice.contact().round_trip > 2 * late
+        assert alice.ask(TakeLease(), timeout=LONG).outcome is Outcome.DONE
+        assert alice.ask(Stop(), timeout=LONG).outcome is Outcome.DONE
+        assert vehicle.asks() == [Stop()], "it was repeated before the first answer could come"
+        for _ in range(20):
+            assert alice.contact().age > 2 * late
+            assert vehicle.heard() > 2 * late
+            pause(0.01)
+        alice.close()
+
+
 def test_the_vehicle_goes_and_comes_back(vehicle: Vehicle, join: Callable[..., Client]) -> None:
     alice = join("alice")
     vehicle.link.stop()
