@@ -21,7 +21,8 @@ from onboard.records import (
     RunInfo,
     Timing,
 )
-from onboard.roster import NAME_RULE, Member, Role, Roster, RosterError, is_name, load_roster
+from onboard.roster import Member, Role, Roster, RosterError, load_roster
+from onboard.wire import NAME_RULE, is_name
 from sim_backend.plant import Truth
 
 __all__ = [

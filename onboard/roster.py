@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
@@ -11,13 +10,7 @@ from typing import Literal
 import msgspec
 from msgspec import Struct
 
-_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
-NAME_RULE = "it takes small letters, digits, - and _, 32 at most, a letter or a digit first"
-
-
-def is_name(text: str) -> bool:
-    """Whether a text may name a person or a machine: it goes into certificates, keys of the link and file names."""
-    return _NAME.fullmatch(text) is not None
+from onboard.wire import NAME_RULE, is_name
 
 
 class Role(StrEnum):

@@ -35,6 +35,7 @@ _REFUSAL: Final = b"pipewright: "
 LARGEST: Final = 16 * 1024
 #: Names of vehicles, stations and sessions.
 NAME: Final = r"^[a-z0-9][a-z0-9_-]{0,31}\Z"
+NAME_RULE: Final = "it takes small letters, digits, - and _, 32 at most, a letter or a digit first"
 
 Text = Annotated[str, Meta(max_length=1000)]
 Name = Annotated[str, Meta(pattern=NAME)]
@@ -309,9 +310,13 @@ class Keys:
         return Place(named("station", parts[0]), named("session", parts[1]), parts[2])
 
 
+def is_name(text: str) -> bool:
+    """Whether a text may name a person or a machine: it goes into certificates, keys of the link and file names."""
+    return re.match(NAME, text) is not None
+
+
 def named(kind: str, name: str) -> str:
     """The same name. Raises WireError for one that cannot be part of a key."""
-    if not re.fullmatch(NAME, name):
-        wanted = "small letters, digits, - and _, 32 at most, a letter or a digit first"
-        raise WireError(f"{name[:100]!r} is no name of a {kind}; it takes {wanted}")
+    if not is_name(name):
+        raise WireError(f"{name[:100]!r} is no name of a {kind}; {NAME_RULE}")
     return name

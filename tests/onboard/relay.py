@@ -11,14 +11,6 @@ from types import TracebackType
 from typing import Self
 
 
-def free_port() -> int:
-    """A port of loopback that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
 class Relay:
     """Carries TCP connections from ``port`` to another port of loopback, ``delay`` seconds late each way.
 

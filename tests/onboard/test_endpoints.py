@@ -7,7 +7,7 @@ import re
 import pytest
 
 from onboard.endpoints import LinkError, open_session, unfit
-from tests.onboard.relay import free_port
+from tests.zenoh_sessions import free_port
 
 
 def one(endpoint: str, *, plain: bool = True, secured: bool = False) -> str:

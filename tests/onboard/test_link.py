@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -15,6 +16,7 @@ from msgspec.structs import replace
 
 from drivers.mailbox import Level
 from groundstation.client import Client, NoAnswerError, StationSettings
+from onboard.admission import station_security, vehicle_security
 from onboard.core.types import Event, Phase, Request, Severity, Tick
 from onboard.declared import describe
 from onboard.endpoints import LinkError, NoVehicleError, open_session
@@ -22,6 +24,7 @@ from onboard.layers import ConfigError
 from onboard.link import Asked, Link
 from onboard.link_settings import LinkSettings
 from onboard.params import load
+from onboard.roster import Role
 from onboard.sessions import MOST_OF_ONE
 from onboard.wire import (
     Ack,
@@ -45,9 +48,10 @@ from onboard.wire import (
     read_refusal,
     read_telemetry,
 )
-from tests.onboard.relay import Relay, free_port
+from tests.onboard.relay import Relay
 from tests.synthetic import mission
 from tests.waiting import LONG, pause, seconds_until
+from tests.zenoh_sessions import Fleet, free_port
 
 TICKS = [tick for tick, _ in mission()]
 ON_GROUND, FLYING = TICKS[0], next(tick for tick in TICKS if tick.outputs.phase is Phase.APPROACH)
@@ -619,3 +623,36 @@ def test_settings_are_parameters_as_all_others() -> None:
         load(LinkSettings, {"vehicle": "X 600", "peer_lease": 0.01, "speed": 3}, "here")
     assert len(caught.value.errors) == 3
     assert all(parameter.doc and not parameter.in_flight for parameter in describe(LinkSettings))
+
+
+# --- with certificates ------------------------------------------------------------------------------------------------
+
+
+def test_operator_viewer_and_stranger_with_certificates(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path / "authority", x500=Role.VEHICLE, alice=Role.OPERATOR, victor=Role.VIEWER)
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    admission = vehicle_security("x500", fleet["x500"], fleet.authority.roster)
+    link = Link(LinkSettings("x500", (endpoint,)), lambda asked: asked.done(asked.station), admission)
+
+    def station(holder: str, name: str, timeout: float = LONG) -> Client:
+        certificate = station_security("x500", fleet[holder])
+        return Client(StationSettings("x500", (endpoint,), name), timeout=timeout, security=certificate)
+
+    link.start()
+    try:
+        with station("alice", "alice") as alice, station("victor", "victor") as victor:
+            assert alice.ask(TakeLease()).outcome is Outcome.DONE
+            assert alice.ask(HOLD).text == "alice"
+            assert victor.ask(Stop()).text == "victor"
+            with pytest.raises(NoAnswerError):
+                victor.ask(TakeLease(seize=True), timeout=0.3)
+            link.tick(FLYING)
+            seconds_until(lambda: newest(alice) == newest(victor) == FLYING)
+            assert link.state().commander == "alice"
+        with pytest.raises(NoVehicleError, match="does not hear this station: is alice admitted"):
+            station("victor", "alice", timeout=0.5)
+        plain = endpoint.replace("tls", "tcp")
+        with pytest.raises(NoVehicleError):
+            Client(StationSettings("x500", (plain,), "alice", plain=True), timeout=0.5)
+    finally:
+        link.stop()

@@ -15,8 +15,8 @@ from groundstation.client import Client, StationSettings
 from onboard.link import Asked, Link
 from onboard.link_settings import LinkSettings
 from onboard.wire import Ack, Outcome, Stop, TakeLease
-from tests.onboard.relay import free_port
 from tests.waiting import LONG, seconds_until
+from tests.zenoh_sessions import free_port
 
 #: How soon a peer that is frozen or dead is noticed, s; and how often that is tried, for a busy machine may be late.
 SOON, TIMES = 1.0, 3
