@@ -6,6 +6,7 @@ A path is the tuple of keys from the root; elements of lists are addressed by th
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -95,6 +96,8 @@ def show(value: Any) -> str:
 # --- YAML -------------------------------------------------------------------------------------------------------------
 
 
+#: Longer than any line.
+_ENDLESS = 1_000_000
 _TAG = "tag:yaml.org,2002:"
 _FLOAT = r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
 # The core schema of YAML 1.2: 1e-4 is a number, `off` is text, 010 is ten, 1:30 is no number.
@@ -236,6 +239,23 @@ def _integer(text: str) -> int | str:
         return text
 
 
-def dump_text(values: dict[str, Any]) -> str:
+def compose_yaml(text: str) -> yaml.Node | None:
+    """The nodes of YAML text that ``parse_yaml`` reads, with their places; None when there is nothing in it."""
+    root: yaml.Node | None = yaml.compose(text, Loader=_Loader)
+    return root
+
+
+def dump_text(values: dict[str, Any], indent: int = 2) -> str:
     """YAML text of plain values that reads back to the same values, to the bit."""
-    return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+    return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120, indent=indent)
+
+
+def inline_text(value: Any) -> str:
+    """The same for one value, in one line."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{inline_text(key)}: {inline_text(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(inline_text, value)) + "]"
+    if isinstance(value, str) and not value.isprintable():
+        return json.dumps(value)
+    return yaml.dump([value], Dumper=_Dumper, default_flow_style=True, allow_unicode=True, width=_ENDLESS)[1:-2]

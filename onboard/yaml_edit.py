@@ -1,199 +1,148 @@
-"""Putting values into a YAML file that a person has written: comments, order, quoting and layout stay as they are."""
+"""Putting values into a YAML file that a person has written: every character that need not change stays."""
 
 from __future__ import annotations
 
 import codecs
+import json
 import os
+import re
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
-from io import StringIO
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, NamedTuple, Self
 
-from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from ruamel.yaml.constructor import RoundTripConstructor
-from ruamel.yaml.error import CommentMark
-from ruamel.yaml.nodes import ScalarNode
-from ruamel.yaml.representer import RoundTripRepresenter
-from ruamel.yaml.scalarstring import DoubleQuotedScalarString
-from ruamel.yaml.tokens import CommentToken
-from ruamel.yaml.util import load_yaml_guess_indent
+import yaml
 
-from onboard.layers import ConfigError, Key, dump_text
-
-_TAG: Final = "tag:yaml.org,2002:"
-_KINDS: Final = {int: "int", float: "float", bool: "bool", type(None): "null"}
-#: Longer than any line: what stands on one line stays on one.
-_ENDLESS: Final = 1_000_000
-
-
-class _Written:
-    """A number, truth value or null as its text: the library would write many a float with other digits."""
-
-    def __init__(self, tag: str, text: str) -> None:
-        self.tag, self.text = tag, text
-
-    def __str__(self) -> str:
-        return self.text
-
-
-class _Constructor(RoundTripConstructor):
-    """Leaves the text of such values as it stands."""
-
-    def keep(self, node: ScalarNode) -> _Written:
-        return _Written(str(node.tag), node.value)
-
-
-class _Representer(RoundTripRepresenter):
-    """Writes that text."""
-
-    def written(self, value: _Written) -> ScalarNode:
-        node: ScalarNode = self.represent_scalar(value.tag, value.text)
-        return node
-
-
-for _name in ("int", "float", "bool", "null", "timestamp"):
-    _Constructor.add_constructor(f"{_TAG}{_name}", _Constructor.keep)
-_Representer.add_representer(_Written, _Representer.written)
+from onboard.layers import ConfigError, Key, compose_yaml, dump_text, inline_text
 
 
 def edited(text: str, values: Iterable[tuple[Key, Any]]) -> str:
     """The text with these values at these paths.
 
-    text: a YAML mapping that ``onboard.layers.parse_yaml`` reads, or nothing but comments. values: plain values, each
-    at the path of its keys; an element of a list by its index. What is not there yet is added at the end of its group;
-    a path into a list that is not there is an error (KeyError), since the rest of the list is not known here.
+    text: a YAML mapping that ``onboard.layers.parse_yaml`` reads, or nothing but comments, with line ends of Unix.
+    values: plain values, each at the path of its keys; an element of a list by its index. What is not there yet is
+    added at the end of its group. Raises KeyError for an element of a list that is not there.
     """
-    yaml = YAML()
-    yaml.Constructor, yaml.Representer = _Constructor, _Representer
-    yaml.preserve_quotes = True
-    yaml.width = _ENDLESS
-    yaml.allow_duplicate_keys = False
-    _, indent, offset = load_yaml_guess_indent(text)
-    yaml.indent(mapping=2 if offset is not None else indent or 2, sequence=indent or 2, offset=offset or 0)
-    root = yaml.load(text)
-    before = ""
-    if root is None:
-        root, before = CommentedMap(), f"{text.rstrip()}\n" if text.strip() else ""
     for path, value in values:
-        _put(root, path, value)
-    out = StringIO()
-    yaml.dump(root, out)
-    return before + out.getvalue()
+        text = _put(text, path, value)
+    return text
 
 
-def _put(root: Any, path: Key, value: Any) -> None:
-    at = root
+class _Found(NamedTuple):
+    """How far a path leads: the node there, the key before it (of a mapping), and what of the path is left."""
+
+    node: yaml.Node
+    key: yaml.Node | None
+    rest: Key
+
+
+def _put(text: str, path: Key, value: Any) -> str:
+    root = compose_yaml(text)
+    if root is None:
+        return (f"{text.rstrip()}\n" if text.strip() else "") + dump_text(_nested(path, value))
+    node, key, rest = _follow(root, path)
+    if not rest:
+        return _replaced(text, node, key, value)
+    if isinstance(node, yaml.MappingNode):
+        return _added(text, root, node, _nested(rest, value))
+    if isinstance(node, yaml.SequenceNode):
+        raise KeyError(path)
+    if key is None:
+        raise KeyError(path)
+    return _replaced(text, node, key, _nested(rest, value))
+
+
+def _follow(root: yaml.Node, path: Key) -> _Found:
+    node, key = root, None
     for depth, part in enumerate(path):
-        key = _key(at, part)
-        rest = path[depth + 1 :]
-        if not rest or (isinstance(at, CommentedMap) and not isinstance(at.get(key), CommentedMap | CommentedSeq)):
-            for inner in reversed(rest):
-                value = {_new_key(inner): value}
-            _set(at, key, value)
-            return
-        at = at[key]
-    raise KeyError(path)  # an element that is no group
+        if isinstance(node, yaml.MappingNode):
+            pair = next((pair for pair in node.value if pair[0].value == part), None)
+            if pair is None:
+                return _Found(node, key, path[depth:])
+            key, node = pair
+        elif isinstance(node, yaml.SequenceNode) and part.isdecimal() and int(part) < len(node.value):
+            key, node = None, node.value[int(part)]
+        else:
+            return _Found(node, key, path[depth:])
+    return _Found(node, key, ())
 
 
-def _key(at: Any, part: str) -> Any:
-    """The key as it stands there: an index of a list; in a mapping, maybe a number that is meant as a name."""
-    if isinstance(at, CommentedSeq):
-        if not part.isdecimal() or int(part) >= len(at):
-            raise KeyError(part)
-        return int(part)
-    if not isinstance(at, CommentedMap):
-        raise KeyError(part)
-    return next((known for known in at if str(known) == part), _new_key(part))
+def _nested(path: Key, value: Any) -> Any:
+    """The value under these keys. An index of a list that stands in another file is written without quotes."""
+    for part in reversed(path):
+        value = {int(part) if part.isdecimal() else part: value}
+    return value
 
 
-def _new_key(part: str) -> str | int:
-    """An index of a list that stands in another file is written without quotes."""
-    return int(part) if part.isdecimal() else part
-
-
-def _set(at: Any, key: Any, value: Any) -> None:
-    """Set an element or a key. What stands behind the group (a blank line, a heading) stays behind it.
-
-    To the library, whatever stands between two keys belongs to the value before it.
-    """
-    behind = ""
-    if isinstance(at, CommentedSeq) or key in at:
-        old = at[key]
-        if _is_block(old):
-            behind = _take_behind(at, key)
+def _replaced(text: str, node: yaml.Node, key: yaml.Node | None, value: Any) -> str:
+    """Another value in the place of a node. A comment behind it keeps its column, where there is room."""
+    begin, end = node.start_mark.index, _end(text, node)
+    if key is not None and (_is_block(node) or begin == end):
+        begin = text.index(":", key.end_mark.index) + 1
+        after = " "
     else:
-        old = None
-        if at and _is_block(at):
-            behind = _take_behind(at, list(at)[-1])
-    at[key] = _laid_out(value, old, isinstance(at, CommentedMap))
-    if behind:
-        holder, last = _innermost(at, key)
-        slot: list[CommentToken | None] = [None] * 4
-        slot[_slot(holder)] = CommentToken(f"\n{behind}", CommentMark(0), None)
-        holder.ca.items[last] = slot
+        after = ""
+    if anchor := re.match(r"&\S+\s+", text[begin:end]):
+        begin += anchor.end()
+    new = after + _in_the_form_of(node, value)
+    behind = text[end:]
+    if (spaces := re.match(r" +(?=#)", behind)) and "\n" not in text[begin:end]:
+        room = len(spaces[0]) + (end - begin) - len(new)
+        behind = " " * max(room, 2) + behind[len(spaces[0]) :]
+    return text[:begin] + new + behind
 
 
-def _is_block(value: Any) -> bool:
-    return isinstance(value, CommentedMap | CommentedSeq) and bool(value) and not value.fa.flow_style()
+def _in_the_form_of(node: yaml.Node, value: Any) -> str:
+    style = node.style if isinstance(node, yaml.ScalarNode) else None
+    if isinstance(value, str) and style == '"':
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, str) and style == "'" and "\n" not in value:
+        return "'" + value.replace("'", "''") + "'"
+    return inline_text(value)
 
 
-def _innermost(at: Any, key: Any) -> tuple[Any, Any]:
-    """Where the last line of a value is: the group or list that holds it, and its key there."""
-    while _is_block(at[key]):
-        at = at[key]
-        key = list(at)[-1] if isinstance(at, CommentedMap) else len(at) - 1
-    return at, key
+def _added(text: str, root: yaml.Node, group: yaml.MappingNode, new: dict[Any, Any]) -> str:
+    """New keys as the last of a group."""
+    if not _is_block(group):
+        at = _end(text, group.value[-1][1]) if group.value else group.end_mark.index - 1
+        return text[:at] + (", " if group.value else "") + inline_text(new)[1:-1] + text[at:]
+    column = group.start_mark.column
+    at = _end(text, group)
+    for line in text[at:].splitlines(keepends=True):  # the rest of its line, then comments that stand in the group
+        if at != _end(text, group) and not (line.lstrip().startswith("#") and 0 < column <= _indent(line)):
+            break
+        at += len(line)
+    lines = dump_text(new, indent=_step(root)).splitlines(keepends=True)
+    before = text[:at] + ("" if text[:at].endswith("\n") else "\n")
+    return before + "".join(" " * column + line for line in lines) + text[at:]
 
 
-def _slot(holder: Any) -> int:
-    return 2 if isinstance(holder, CommentedMap) else 0
+def _is_block(node: yaml.Node) -> bool:
+    return isinstance(node, yaml.CollectionNode) and not node.flow_style
 
 
-def _take_behind(at: Any, key: Any) -> str:
-    """Take away, and give, what stands behind a value: from the first line on that is blank or not of its group."""
-    holder, last = _innermost(at, key)
-    slot = holder.ca.items.get(last)
-    token = slot[_slot(holder)] if slot else None
-    if token is None:
-        return ""
-    own, _, rest = token.value.partition("\n")
-    lines = rest.splitlines(keepends=True)
-    column = holder.lc.col or 0
-    n = next((i for i, line in enumerate(lines) if not column or _indent(line) < column), len(lines))
-    kept = f"{own}\n{''.join(lines[:n])}"
-    if kept.strip():
-        token.value = kept
-    else:
-        slot[_slot(holder)] = None
-    return "".join(lines[n:])
+def _end(text: str, node: yaml.Node) -> int:
+    """Where the text of a node ends. The parser has that of a block only where the next thing begins."""
+    while _is_block(node) and node.value:
+        last = node.value[-1]
+        node = last[1] if isinstance(last, tuple) else last
+    begin, end = node.start_mark.index, node.end_mark.index
+    return begin + len(text[begin:end].rstrip()) if isinstance(node, yaml.ScalarNode) else int(end)
 
 
 def _indent(line: str) -> int:
-    return len(line) - len(line.lstrip()) if line.strip() else 0
+    return len(line) - len(line.lstrip())
 
 
-def _laid_out(value: Any, old: Any, in_mapping: bool) -> Any:
-    """The value in the form in which the old one stood."""
-    if isinstance(value, Mapping):
-        group = CommentedMap((key, _laid_out(item, None, True)) for key, item in value.items())
-        if isinstance(old, CommentedMap | CommentedSeq) and old.fa.flow_style():
-            group.fa.set_flow_style()
-        return group
-    if isinstance(value, list | tuple):
-        items = CommentedSeq(_laid_out(item, None, False) for item in value)
-        if not any(isinstance(item, CommentedMap | CommentedSeq) for item in items) or not in_mapping:
-            items.fa.set_flow_style()
-        return items
-    text = dump_text({"value": value}).removeprefix("value: ").removesuffix("\n")
-    if not isinstance(value, str):
-        return _Written(f"{_TAG}{_KINDS[type(value)]}", text)
-    if isinstance(old, str) and type(old) is not str:  # in its own quotes
-        return type(old)(value)
-    return value if text == value else DoubleQuotedScalarString(value)
+def _step(root: yaml.Node) -> int:
+    """By how much the groups of a file are indented."""
+    if isinstance(root, yaml.MappingNode):
+        for _, value in root.value:
+            if isinstance(value, yaml.MappingNode) and _is_block(value):
+                return int(value.start_mark.column) - int(root.start_mark.column)
+    return 2
 
 
 class Candidate:

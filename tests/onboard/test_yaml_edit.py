@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +40,32 @@ def values_of(text: str) -> dict[str, Any]:
     return parse_yaml(text, "f.yaml").values
 
 
+def leaves(values: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    items = values.items() if isinstance(values, dict) else enumerate(values) if isinstance(values, list) else ()
+    if not items:
+        yield path
+    for key, value in items:
+        yield from leaves(value, (*path, str(key)))
+
+
+def with_value(values: Any, path: tuple[str, ...], value: Any) -> Any:
+    if not path:
+        return value
+    if isinstance(values, list):
+        return [with_value(item, path[1:], value) if str(i) == path[0] else item for i, item in enumerate(values)]
+    return values | {path[0]: with_value(values[path[0]], path[1:], value)}
+
+
 @pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: path.name)
-def test_a_file_to_which_nothing_is_done_stays_as_it_is(path: Path) -> None:
+def test_any_value_of_any_file_is_changed_alone(path: Path) -> None:
     text = path.read_text("utf-8")
-    assert edited(text, []) == text
+    values = values_of(text)
+    places = list(leaves(values))
+    for place in places[:: len(places) // 15 + 1]:
+        after = edited(text, [(place, "else")])
+        assert values_of(after) == with_value(values, place, "else")
+        assert re.findall("#.*", after) == re.findall("#.*", text)
+        assert len(after.splitlines()) == len(text.splitlines())
 
 
 def test_a_value_is_changed_where_it_stands() -> None:
@@ -54,7 +78,7 @@ def test_a_value_is_changed_where_it_stands() -> None:
             (("devices", "autopilot", "parameters"), "mine.params"),
         ],
     )
-    wanted = TEXT.replace("[2.0, 0.0, 1.5]   #", "[2.0, -0.5, 1.5]  #").replace("2.5     ", "3.0     ")
+    wanted = TEXT.replace("[2.0, 0.0, 1.5]   #", "[2.0, -0.5, 1.5]   #").replace("2.5     ", "3.0     ")
     wanted = wanted.replace('"real"', '"mock"').replace("'x500.params'", "'mine.params'")
     assert after == wanted
 
@@ -82,9 +106,19 @@ def test_a_list_that_is_replaced_leaves_what_stands_behind_it() -> None:
 
 def test_the_indentation_is_that_of_the_file() -> None:
     text = "a:\n    b: 1\n    c:\n        d: 2\n"
-    assert edited(text, [(("a", "c", "e", "f"), 3)]) == text + "            f: 3\n".replace("f", "f", 1).join(
-        ["        e:\n", ""]
-    )
+    assert edited(text, [(("a", "c", "e", "f"), 3)]) == text + "        e:\n            f: 3\n"
+
+
+def test_a_list_over_several_lines_keeps_its_comments() -> None:
+    text = "may_differ:\n  [A, B,    # of simulators\n   C]        # of batteries\nb: {x: 1,   # one\n    y: 2}\n"
+    after = edited(text, [(("may_differ", "1"), "D"), (("b", "y"), 3), (("b", "z"), 4)])
+    assert after == text.replace("B,", "D,").replace("y: 2}", "y: 3, z: 4}")
+
+
+def test_a_value_that_is_empty_or_a_text_of_several_lines_is_replaced() -> None:
+    text = "a:\n  b:\n  c: |\n    one\n    two\n\n# about d\nd:   # nothing\n"
+    after = edited(text, [(("a", "b"), 1), (("a", "c"), "x"), (("d", "e"), 2)])
+    assert after == "a:\n  b: 1\n  c: x\n\n# about d\nd: {e: 2}  # nothing\n"
 
 
 def test_a_file_of_comments_keeps_them() -> None:
