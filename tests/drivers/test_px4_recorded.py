@@ -10,6 +10,7 @@ import asyncio
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ class Player(asyncio.DatagramProtocol):
     """Plays the recording, and answers what the driver asks as PX4 has answered it."""
 
     def __init__(self) -> None:
-        self.left = list(reversed(FLIGHT))
+        self.left: list[Packet] = [*reversed(FLIGHT)]
         self.asked: list[int] = []
         """Numbers of the commands that have come."""
         self._transport: Any = None
@@ -75,7 +76,7 @@ class Player(asyncio.DatagramProtocol):
 
     def play(self) -> Packet:
         """Say the next packet that the driver has not asked for."""
-        packet = self.left.pop()
+        packet: Packet = self.left.pop()
         if packet.name not in ("COMMAND_ACK", "PARAM_VALUE"):
             self.say(packet)
         return packet
@@ -114,9 +115,12 @@ async def rest(px4: Px4, player: Player, look: Callable[[Packet], None]) -> None
         before = px4.counts().get(name)
         packet = player.play()
         if before is not None:
-            counted = before.received
-            await until(lambda name=name, counted=counted: px4.counts()[name].received > counted)
+            await until(partial(_came, px4, name, before.received))
             look(packet)
+
+
+def _came(px4: Px4, name: str, before: int) -> bool:
+    return px4.counts()[name].received > before
 
 
 def texts(notices: tuple[Notice, ...]) -> list[str]:
