@@ -140,7 +140,8 @@ def test_reboot(book: Book) -> None:
     told.says(OLD, *LOST, "the link to PX4 is lost", "PX4 has rebooted: its time began anew")
     told.says("the link to PX4 is back")
     assert "autopilot_lost" in told.demands
-    assert told.phases == [Phase.PREFLIGHT, Phase.TAKEOFF, Phase.LAND, Phase.STOPPED]
+    assert told.phases[:2] == [Phase.PREFLIGHT, Phase.TAKEOFF]
+    assert told.phases[-2:] == [Phase.LAND, Phase.STOPPED]
 
 
 @pytest.mark.parametrize("name", [name for name in STORIES if name.startswith("again")])
