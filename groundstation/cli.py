@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-from groundstation import calibrate
+from groundstation import calibrate, keys, params
 from groundstation.desk import Desk, WorldError
 
 COMPLETED, BROKEN, WRONG_INPUT, SAFE, LOST, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
@@ -134,6 +134,8 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
     calibrate.add_parser(commands)
+    params.add_parser(commands)
+    keys.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")
     replay.add_argument("log", type=Path, metavar="LOG", help=_LOG_HELP)
