@@ -20,7 +20,7 @@ def broken_off(folder: Path, shown: str) -> float:
     """The run in this folder ended early, but was recorded up to what was shown last; gives its length, s."""
     told = json.loads((folder / "metrics.json").read_text())
     assert told["outcome"] == "unfinished"
-    seconds = float(re.findall(r"([\d.]+) s simulated", shown)[-1])
+    seconds = float(re.findall(r"([\d.]+) s flown", shown)[-1])
     assert told["sim_s"] > seconds - 1.0, "what is not yet written is less than a second"
     return float(told["sim_s"])
 
