@@ -384,13 +384,13 @@ def settled(vehicle: Vehicle, seed: int = 0, ideal: bool = True) -> World:
 
 
 def test_sensors_of_a_vehicle_at_rest(vehicle: Vehicle) -> None:
-    """It stands level and looks east, so that north is on its left."""
+    """It stands level and looks east, so that north is on its left. Compass and barometer are never without noise."""
     world = settled(vehicle)
     (m,) = Px4Sensors(SensorParams()).measure(world.snapshot)
     assert (m.xacc, m.yacc, m.zacc) == pytest.approx((0.0, 0.0, -vehicle.gravity), abs=0.02)
     assert (m.xgyro, m.ygyro, m.zgyro) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
-    assert (m.xmag, m.ymag, m.zmag) == pytest.approx((0.0, -0.215, 0.427), abs=1e-3)
-    assert m.abs_pressure == pytest.approx(pressure_at(488.0 + world.truth().p_WB[2]), abs=1e-3)
+    assert (m.xmag, m.ymag, m.zmag) == pytest.approx((0.0, -0.215, 0.427), abs=0.01)
+    assert m.abs_pressure == pytest.approx(pressure_at(488.0 + world.truth().p_WB[2]), abs=0.1)
     assert m.time_usec == 100_000
     assert m.id == 0
 
