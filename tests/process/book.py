@@ -17,6 +17,8 @@ from tests.process.flying import Flying, flying
 
 #: On top of the time after which a condition acts, s: the machine may be busy.
 MARGIN = 1.0
+#: For stories of other devices: a machine that is busy keeps the bytes of a pseudo-terminal back.
+PATIENT_BUS = ("devices.servos.reply_margin=0.02", "devices.servos.silent_after=0.4")
 #: What any flight may say beside its story, on a machine that is busy.
 _ASIDE = re.compile(r"tick came after|The loop is slow|comes at \d+ Hz|at the rates? asked for|reading of the servos")
 _RATE = 250.0

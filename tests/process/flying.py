@@ -23,6 +23,8 @@ from tests.realtime import alone
 
 #: Whatever is waited for comes well before this, s: the machine may be busy.
 PATIENCE = 60.0
+#: Of which one gets into the air.
+TAKEOFFS = 3
 #: A brisk flight: takes off to 0.8 m and presses about 25 s later.
 BRISK = (
     "pipe.position=[1.6,0,1.2]",
@@ -207,11 +209,19 @@ class Flying:
         return self.wait("hover", lambda look: look.truth.p_WB[2] > 0.75)
 
     def hover(self) -> Look:
-        """Up to the hover, whatever its height, from the first preflight or after a ``reset``; the takeoff is over."""
+        """Up to the hover, whatever its height, from the first preflight or after a ``reset``; the takeoff is over.
+
+        One that a busy machine has broken off on the ground is tried again.
+        """
         self.wait_said("ready")
-        self.ask("takeoff")
-        taking_off = self.wait("takeoff", lambda look: look.phase == Phase.TAKEOFF)
-        return self.wait("hover", lambda look: look.phase == Phase.HOLD, since=taking_off)
+        for _ in range(TAKEOFFS):
+            self.ask("takeoff")
+            taking_off = self.wait("takeoff", lambda look: look.phase == Phase.TAKEOFF)
+            ended = self.wait("hover", lambda look: look.phase in (Phase.HOLD, Phase.STOPPED), since=taking_off)
+            if ended.phase == Phase.HOLD:
+                return ended
+            self.reset()
+        raise AssertionError(f"{TAKEOFFS} takeoffs were broken off")
 
     def land(self) -> Look:
         """Down by request."""

@@ -9,7 +9,7 @@ import pytest
 
 from onboard.core.types import Action, Phase
 from sim_backend.px4_emulator import KINDS
-from tests.process.book import Book, again, down, lands, strikes
+from tests.process.book import PATIENT_BUS, Book, again, down, lands, strikes
 from tests.process.flying import Flying
 from tests.realtime import REALTIME
 
@@ -55,7 +55,7 @@ LOST = ("The autopilot is silent: asking it to land", "the autopilot lands by it
 
 @pytest.fixture(scope="module")
 def book(tmp_path_factory: pytest.TempPathFactory) -> Book:
-    return Book(tmp_path_factory.mktemp("autopilot"), STORIES, "plan.takeoff_height=0.5")
+    return Book(tmp_path_factory.mktemp("autopilot"), STORIES, *PATIENT_BUS, "plan.takeoff_height=0.5")
 
 
 def test_every_fault_has_its_story() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from onboard.core.types import Action, Phase
 from sim_backend.tracker import KINDS
-from tests.process.book import Book, Told, again, lands, strikes
+from tests.process.book import PATIENT_BUS, Book, Told, again, lands, strikes
 from tests.realtime import REALTIME
 
 pytestmark = REALTIME
@@ -47,7 +47,7 @@ BACK = "its frame begins where it was lost"
 
 @pytest.fixture(scope="module")
 def book(tmp_path_factory: pytest.TempPathFactory) -> Book:
-    return Book(tmp_path_factory.mktemp("odometry"), STORIES, "plan.takeoff_height=0.5")
+    return Book(tmp_path_factory.mktemp("odometry"), STORIES, *PATIENT_BUS, "plan.takeoff_height=0.5")
 
 
 def test_every_fault_has_its_story() -> None:
@@ -58,7 +58,7 @@ def test_drop(book: Book) -> None:
     """Two poses of five are enough to fly."""
     told = book["drop"]
     told.lives_on()
-    told.says("tracker: its poses come at", "tracker: its poses come at 200 Hz again")
+    told.says("Hz, want 200 Hz: check USB 3", "tracker: its poses come at 200 Hz again")
     told.says_no(OLD)
     told.hovers()
 

@@ -115,6 +115,16 @@ def test_drag_slows_towards_its_terminal_speed(vehicle: Vehicle) -> None:
     assert balance(plant, vehicle)[1][0] - before == pytest.approx(-5.0 * 1.0 * 0.01, rel=0.02)
 
 
+def test_a_limp_arm_touches_the_ground_before_the_skids(vehicle: Vehicle) -> None:
+    """Where it hangs down, the vehicle stands on it; that is on the ground too."""
+    plant = RigidBody(vehicle, PlantParams(), PIPE, 0.0, RADIUS)
+    plant.x[at.JOINT : at.JOINT + 3] = (-1.62, 0.287, -2.356)
+    for height, touches in ((0.015, True), (0.03, False)):
+        plant.x[at.POSITION + 2] = vehicle.base.gear_height + height
+        plant.advance(OFF, 1e-3)
+        assert plant.truth().on_ground is touches
+
+
 def test_starts_at_rest_on_its_skids_and_stays(vehicle: Vehicle) -> None:
     plant = RigidBody(vehicle, PlantParams(), PIPE, 0.0, RADIUS)
     start = plant.truth()
