@@ -68,7 +68,7 @@ class Machine:
         if len(took) < _MANY and max(took, default=0.0) < _LOST:
             return ""
         longest = max(took)
-        return f"the machine is too busy for real time: it held {len(took)} bytes of a terminal back, one by {longest:.3f} s"
+        return f"the machine is too busy: it held {len(took)} bytes of a terminal back, one by {longest:.3f} s"
 
     def stop(self) -> None:
         """Watch no more."""
