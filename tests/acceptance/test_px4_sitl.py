@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -68,7 +68,9 @@ def test_the_same_core_replays_it_without_difference(flown: Flown) -> None:
 
 @pytest.mark.parametrize("where", ["hover", "press"])
 @pytest.mark.parametrize("way", [signal.SIGSTOP, signal.SIGKILL], ids=["stopped", "killed"])
-def test_px4_brings_the_vehicle_down_when_the_process_falls_silent(tmp_path: Path, way: int, where: str) -> None:
+def test_px4_brings_the_vehicle_down_when_the_process_falls_silent(
+    tmp_path: Path, way: int, where: str, record_property: Callable[[str, object], None]
+) -> None:
     # A busy machine holds back the bytes of a servo bus on a pseudo-terminal, which is not what is looked at here.
     servos = "devices.servos.kind=mock"
     with alone(), GroundStation() as ground, Flying(tmp_path, servos, config="sitl") as flight:
@@ -79,6 +81,7 @@ def test_px4_brings_the_vehicle_down_when_the_process_falls_silent(tmp_path: Pat
         flight.signal(way)
         silent = time.monotonic_ns()
         failsafe = ground.wait("failsafe", lambda packet: packet.mode in DOWN, PATIENCE, since=silent)
+        record_property("failsafe_after_s", (failsafe.t_ns - silent) * 1e-9)
         assert (failsafe.t_ns - silent) * 1e-9 < LOSS + MARGIN
         flight.ended_safely()
         # One late set-point, of a library or of an orphan, and PX4 would be back in offboard. (Disarmed, it is: it goes
