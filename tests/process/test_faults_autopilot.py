@@ -35,16 +35,14 @@ STORIES = {
     "freeze": strikes(PX4, "freeze", 2.2, duration=0.3),
     "nan": strikes(PX4, "nan", 2.2, duration=0.3),
     "silent": strikes(PX4, "silent", 2.0, duration=0.3),
-    "delay for long": lands(PX4, "delay", 3.0, value=0.6),
-    "again 1": again,
     "frozen for long": lands(PX4, "freeze", 3.0),
-    "again 2": again,
+    "again 1": again,
     "nan for long": lands(PX4, "nan", 2.0),
-    "again 3": again,
+    "again 2": again,
     "silent for long": lands(PX4, "silent", 2.0),
-    "again 4": again,
+    "again 3": again,
     "unplugged": lands(PX4, "unplugged", 2.0),
-    "again 5": again,
+    "again 4": again,
     "down": down,
     "reboot": reboot,
 }
@@ -110,7 +108,6 @@ def test_silent_for_a_moment(book: Book) -> None:
 
 
 @pytest.mark.parametrize(("name", "words"), [
-    ("delay for long", ()),
     ("frozen for long", ("autopilot: PX4 tells the same attitude over and over", "autopilot: PX4's attitude moves")),
     ("nan for long", ("numbers that are not finite", "autopilot: what PX4 measures is usable again")),
     ("silent for long", ("autopilot: the link to PX4 is lost: nothing comes any more", "the link to PX4 is back")),
