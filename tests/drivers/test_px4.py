@@ -358,8 +358,8 @@ async def test_loss_and_return_of_the_link() -> None:
             fresh = px4.latest()
             assert stale is not None
             assert fresh is not None
+            await until(lambda: second.streams.intervals[31] == pytest.approx(0.004))
             await until(lambda: px4.counts()["ATTITUDE_QUATERNION"].rate > 200.0)
-            assert second.streams.intervals[31] == pytest.approx(0.004)
         finally:
             await px4.stop()
             second.stop()
