@@ -48,7 +48,7 @@ def main() -> None:
     save(run, (60, 0, 1140, 1220), "report")
     save(run, (60, 1240, 1140, 1890), "forces")
     save(run, (60, 3045, 1140, 3690), "pipe")
-    save(desk, (60, 3720, 1140, 4240), "timing")
+    save(desk, (60, 3730, 1140, 4405), "timing")
 
 
 if __name__ == "__main__":
