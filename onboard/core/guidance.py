@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 ZERO: Eight = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 STANDING = (Phase.PREFLIGHT, Phase.STOPPED)
 PRESSING = (Phase.PRESS, Phase.RELEASE)
+#: The tool moves close to the pipe: the arm makes up for where the base is.
+AT_THE_PIPE = (Phase.ADHESIVE, Phase.TOOL_CHANGE)
 BACKING_OUT = (Phase.RETREAT, Phase.RETREAT_HOLD, Phase.RETREAT_LAND)
 #: Between arcs the wrist waits this far back from the middle of the arc, m.
 READY_BACK = 0.06
@@ -260,7 +262,7 @@ def _reference(state: State, params: AllParams, compliant: float, force_ahead: f
         (x, y, z), (vx, vy, vz), (ax, ay, az), yaw, yaw_rate, yaw_acceleration, (wx, wz), (vwx, vwz), elevation,
         elevation_rate, pump, own.gripper_open if open_gripper else own.gripper_closed, state.lift, state.force,
         force_ahead, pressing,
-        leg is not None and leg.pumping, state.phase is Phase.ADHESIVE, compliant, offset.velocity, offset.displacement,
+        leg is not None and leg.pumping, state.phase in AT_THE_PIPE, compliant, offset.velocity, offset.displacement,
     )  # fmt: skip
 
 

@@ -24,7 +24,6 @@ BRISK = (
     "pipe.position=[1.6,0,1.2]",
     "plan.takeoff_height=0.8",
     "plan.standoff=0.8",
-    "plan.gap=0.03",
     "plan.speed=0.8",
     "plan.acceleration=0.8",
     "plan.jerk=2",

@@ -116,7 +116,7 @@ class Told(Struct):
     def lands(self) -> None:
         """It came down out of the hover, and the mission has ended on the ground."""
         down = [Phase.HOLD, Phase.LAND, Phase.STOPPED]
-        assert self.phases[: len(down)] == down
+        assert self.phases[: len(down)] == down, self.phases
         last = self.looks[-1]
         assert last.truth.on_ground
         assert not last.armed
