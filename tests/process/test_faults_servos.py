@@ -97,7 +97,8 @@ def test_silent(book: Book) -> None:
 def test_nobody_answers(book: Book) -> None:
     told = book["all silent"]
     flown_through(told)
-    told.says(NOBODY, "s behind. Check its cable and latency timer.", SILENT, "gripper (id 5) answer again")
+    told.says("s behind. Check its cable and latency timer.", SILENT, "gripper (id 5) answer again")
+    told.says(NOBODY, SILENT)  # the driver's own patience is configured
     told.acts("servos_lost", Action.HOLD, 0.5)
 
 
