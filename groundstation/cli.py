@@ -100,6 +100,7 @@ def _parser() -> argparse.ArgumentParser:
         "--config", dest="scenario", default="desk", metavar="NAME|FILE", help="devices, pipe, task (default: desk)"
     )
     desk.add_argument("--duration", type=float, metavar="SECONDS", help="land after this time")
+    desk.add_argument("--no-autostart", action="store_true", help="wait on the ground for what stations ask")
     desk.set_defaults(run=_desk)
     words = "fly with the devices of this machine: the process of the vehicle's computer"
     onboard = commands.add_parser(
@@ -170,7 +171,8 @@ def _sim(options: argparse.Namespace) -> int:
 def _desk(options: argparse.Namespace) -> int:
     begun, out = time.perf_counter(), _out(options)
     before = _written(out / "log.mcap")
-    arguments = ["--mission", "--out", str(out), *_run_options(options)]
+    mission = [] if options.no_autostart else ["--mission"]
+    arguments = [*mission, "--out", str(out), *_run_options(options)]
     try:
         with Desk(_common(options)) as desk:
             endpoints = desk.start_world()

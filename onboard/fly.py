@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from math import inf
 from pathlib import Path
+from typing import cast
 
 from msgspec import Struct
 
@@ -13,18 +14,23 @@ from drivers.mailbox import Level
 from onboard import attended
 from onboard.clock import WallClock
 from onboard.config import Config, dump_config
-from onboard.core.types import Event, Outputs, Phase, Request, Severity
+from onboard.core.params import Params
+from onboard.core.types import Event, LinkState, Outputs, Phase, Request, Severity, Tick
 from onboard.cpu import CpuMeter
 from onboard.devices import FlightDevices
 from onboard.ending import Ending, hand_over, signals
 from onboard.errand import Errand
 from onboard.loop import Loop
+from onboard.orders import Shows
+from onboard.params import Change
 from onboard.recorder import Recorder
 from onboard.records import DeviceReport
 from onboard.reload import Reloader
 from onboard.scheduling import Collector, ask
 from onboard.simulate import run_info
+from onboard.stations import Stations
 from onboard.systemd import Notifier
+from onboard.wire import ShowParams
 from sim_backend.world_messages import Look
 
 #: A driver's notice as an event of the log.
@@ -51,13 +57,14 @@ async def fly(
     prepare: Callable[[], Path],
     options: Options,
     load: Callable[[], Config],
+    save: Callable[[Params], Sequence[Change]],
     watch: Callable[[Outputs, float], None],
     say: Callable[[str], None],
 ) -> bool:
     """Connect, run the loop until the flight is over, and record it; False: broken off before it began.
 
     ``prepare`` gives the path of the log, once there is something to record; ``load`` reads the configuration again,
-    when a reload is asked for; ``watch`` sees outputs and time (s) of each tick; ``say`` gets sentences for the person
+    when a reload is asked for, and ``save`` writes parameters into its files; ``watch`` sees outputs and time (s) of each tick; ``say`` gets sentences for the person
     at the terminal. Raises DeviceError when a device cannot be had, ConfigError for devices that cannot be flown.
     """
     devices = FlightDevices(config)
@@ -69,7 +76,7 @@ async def fly(
                 if options.attended:
                     attended.watch(flight.order, lambda: end("standard input has closed"))
                 await devices.start(say)
-                await flight.run(prepare(), load)
+                await flight.run(prepare(), load, save)
             finally:
                 notifier.stopping()
                 await devices.stop()
@@ -95,6 +102,7 @@ class _Flight:
         self._clock = WallClock()
         self._loop: Loop | None = None
         self._reloader: Reloader | None = None
+        self._stations: Stations | None = None
         self.began = False
         self._ready = False
         self._report_ns = 0
@@ -106,11 +114,15 @@ class _Flight:
             self._loop.request(request)
 
     def order(self, line: str) -> None:
-        """A request from standard input, in a thread of its own."""
+        """A request from standard input, in a thread of its own: its name, and after ``go`` that of a phase."""
+        name, _, where = line.partition(" ")
         try:
-            self._request(Request(line))
+            request, go = Request(name), Phase(where) if where else None
         except ValueError:
-            self._say(f"no such request: {line!r}; there are: {', '.join(Request)}")
+            self._say(f"no such request: {line!r}; there are: {', '.join(Request)}, and with go a phase")
+            return
+        if self._loop is not None:
+            self._loop.request(request, go=go)
 
     def reload(self) -> None:
         """Read the configuration again."""
@@ -118,14 +130,22 @@ class _Flight:
             self._notifier.reloading()
             self._reloader.ask()
 
-    async def run(self, log: Path, load: Callable[[], Config]) -> None:
+    async def run(
+        self, log: Path, load: Callable[[], Config], save: Callable[[Params], Sequence[Change]]
+    ) -> None:
         """Tick until the flight is over."""
         config, clock, devices = self._config, self._clock, self._devices
         info = run_info(config, realtime=True, started=datetime.now().astimezone().isoformat(timespec="seconds"))
         with Recorder(log, info, config, dump_config(config), t_ns=clock.now_ns(), background=True) as recorder:
             self._recorder = recorder
-            self._loop = loop = Loop(devices, clock, config, recorder, timed=True)
-            self._reloader = Reloader(load, loop)
+            self._loop = loop = Loop(devices, clock, config, _Tee(recorder, self._tick), timed=True, link=self._link)
+            self._reloader = reloader = Reloader(load, loop)
+            if config.link.listen:
+                shows: Shows = {ShowParams: lambda _: dump_config(cast("Config", loop.params)).encode()}
+                self._stations = Stations(
+                    config.link, loop, reloader, devices.autopilot, devices.servos, save, shows
+                )
+                await asyncio.to_thread(self._stations.start)
             self._errand = Errand(loop.request, LONGEST) if self._options.mission else None
             devices.on_look = self._look
             self._cpu = CpuMeter()
@@ -142,12 +162,21 @@ class _Flight:
             finally:
                 devices.on_look = None
                 self._cpu.stop()
+                if self._stations is not None:
+                    await asyncio.to_thread(self._stations.stop)
                 self._reloader.close()
                 self._reloader.join(_JOIN)
         if recorder.error is not None:
             self._say(f"the log is incomplete: {recorder.error}")
         if recorder.dropped:
             self._say(f"{recorder.dropped} records were not written")
+
+    def _link(self) -> LinkState:
+        return LinkState() if self._stations is None else self._stations.state()
+
+    def _tick(self, tick: Tick) -> None:
+        if self._stations is not None:
+            self._stations.tick(tick)
 
     def _on_tick(self, outputs: Outputs) -> bool:
         now = self._clock.now_ns()
@@ -180,7 +209,11 @@ class _Flight:
         for event in outputs.events:  # the recorder has these from the tick
             if event.severity is not Severity.INFO:
                 self._say(event.text)
-        for device, notice in self._devices.notices():
+        notices = self._devices.notices()
+        if self._stations is not None:
+            self._stations.after(outputs)
+            notices += [("link", notice) for notice in self._stations.notices()]
+        for device, notice in notices:
             self._tell(Event(notice.t_ns, device, _SEVERITY[notice.level], notice.text))
         assert self._reloader is not None
         if changes := self._reloader.events(now):
@@ -199,10 +232,25 @@ class _Flight:
 
     def _tell(self, event: Event) -> None:
         self._recorder.event(event)
+        if self._stations is not None:
+            self._stations.event(event)
         self._say(event.text)
 
     def _look(self, look: Look) -> None:
         self._recorder.truth(look.t_ns, look.truth)
+
+
+class _Tee:
+    """The recorder; of each tick, somebody else hears too."""
+
+    def __init__(self, recorder: Recorder, hear: Callable[[Tick], None]) -> None:
+        self._hear = hear
+        self._record = recorder.tick
+        self.keyframe, self.timing, self.revision = recorder.keyframe, recorder.timing, recorder.revision
+
+    def tick(self, tick: Tick) -> None:
+        self._record(tick)
+        self._hear(tick)
 
 
 def _passes(outputs: Outputs) -> bool:

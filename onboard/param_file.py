@@ -10,9 +10,9 @@ from msgspec.structs import replace
 
 from onboard.config import CONFIGS, Config, load_config
 from onboard.declared import to_mapping
-from onboard.layers import ConfigError, Key, parse_yaml, show
+from onboard.layers import ConfigError, Key, Layer, parse_yaml, show
 from onboard.param_table import Entry, entries, find
-from onboard.params import Change, diff
+from onboard.params import Change, compose, diff
 from onboard.yaml_edit import Candidate, edited
 
 #: These choose further files, by which others differ: they are written first, and then what still differs.
@@ -20,7 +20,7 @@ _CHOOSE: Final = ("law", "interface", "joints")
 _ROUNDS: Final = 3
 #: In the folder of a run.
 RUN_CONFIG: Final = "config.yaml"
-__all__ = ["Change", "ConfigError", "Entry", "ParameterFile", "save"]
+__all__ = ["Change", "ConfigError", "Entry", "ParameterFile", "save", "save_in_force"]
 
 
 class ParameterFile:
@@ -39,7 +39,7 @@ class ParameterFile:
 
     def put(self, sets: Sequence[str]) -> tuple[Change, ...]:
         """Write values, each given as ``name.of.parameter=value``, into the file; gives what is changed by them."""
-        path = self._path()
+        path = self.path()
         named = [(text.partition("=")[0].strip(), text) for text in sets]
         others = [text for name, text in named if name != "law"]
         law = next((text.partition("=")[2].strip() for name, text in reversed(named) if name == "law"), None)
@@ -53,20 +53,40 @@ class ParameterFile:
 
     def save(self, other: str) -> tuple[Change, ...]:
         """Make the file give what the other configuration gives (that of a run, say); gives what is changed by it."""
-        return save(self._path(), self._load(other), self._directory)
+        return save(self.path(), self._load(other), self._directory)
 
     def _load(self, given: str) -> Config:
         folder = Path(given)
         name = f"{folder / RUN_CONFIG}" if folder.is_dir() else given
         return load_config(name, directory=self._directory, option="--config")
 
-    def _path(self) -> Path:
+    def path(self) -> Path:
+        """The file. Raises ConfigError for a name: what belongs to the program is not written."""
         if "/" in self._given or self._given.endswith((".yaml", ".yml")):
             return Path(self._given)
         self._load(self._given)  # when there is no such name, that is what is to be said
         raise ConfigError(
             [f"--config {self._given}: belongs to the program; copy its file from {self._directory}, and give the copy"]
         )
+
+
+def save_in_force(given: str, loaded: Config, in_force: Config, directory: Path = CONFIGS) -> tuple[Change, ...]:
+    """Write what has been changed since the start into the file of a configuration; gives what differed.
+
+    given: name or file, as the process was started with; loaded: what file and options make now. What came from options
+    of the command line stays with them. Raises ConfigError, and has written nothing then.
+    """
+    path = ParameterFile(given, directory).path()
+    held = load_config(str(path), directory=directory)
+    changed: dict[str, Any] = {}
+    for change in diff(replace(loaded, scenario=in_force.scenario), in_force):
+        *groups, name = change.path.split(".")
+        place = changed
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[name] = _at(to_mapping(in_force), tuple(change.path.split(".")))
+    wanted = compose(Config, [Layer(str(path), to_mapping(held)), Layer("parameters in force", changed)])
+    return save(path, wanted, directory)
 
 
 def save(path: Path, wanted: Config, directory: Path = CONFIGS) -> tuple[Change, ...]:
