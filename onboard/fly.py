@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from math import inf
@@ -64,8 +65,9 @@ async def fly(
     """Connect, run the loop until the flight is over, and record it; False: broken off before it began.
 
     ``prepare`` gives the path of the log, once there is something to record; ``load`` reads the configuration again,
-    when a reload is asked for, and ``save`` writes parameters into its files; ``watch`` sees outputs and time (s) of each tick; ``say`` gets sentences for the person
-    at the terminal. Raises DeviceError when a device cannot be had, ConfigError for devices that cannot be flown.
+    when a reload is asked for, and ``save`` writes parameters into its files; ``watch`` sees outputs and time (s) of
+    each tick; ``say`` gets sentences for the person at the terminal. Raises DeviceError when a device, or the link,
+    cannot be had, ConfigError for devices that cannot be flown.
     """
     devices = FlightDevices(config)
     with Notifier() as notifier:
@@ -104,7 +106,7 @@ class _Flight:
         self._reloader: Reloader | None = None
         self._stations: Stations | None = None
         self.began = False
-        self._ready = False
+        self._ready = self._reload_first = False
         self._report_ns = 0
         self._until = inf if options.duration is None else options.duration
         self.ending = Ending(self._request)
@@ -125,26 +127,26 @@ class _Flight:
             self._loop.request(request, go=go)
 
     def reload(self) -> None:
-        """Read the configuration again."""
+        """Read the configuration again; once there is a loop to put it into force."""
+        self._notifier.reloading()
         if self._reloader is not None:
-            self._notifier.reloading()
             self._reloader.ask()
+        else:
+            self._reload_first = True
 
-    async def run(
-        self, log: Path, load: Callable[[], Config], save: Callable[[Params], Sequence[Change]]
-    ) -> None:
+    async def run(self, log: Path, load: Callable[[], Config], save: Callable[[Params], Sequence[Change]]) -> None:
         """Tick until the flight is over."""
         config, clock, devices = self._config, self._clock, self._devices
         info = run_info(config, realtime=True, started=datetime.now().astimezone().isoformat(timespec="seconds"))
         with Recorder(log, info, config, dump_config(config), t_ns=clock.now_ns(), background=True) as recorder:
             self._recorder = recorder
             self._loop = loop = Loop(devices, clock, config, _Tee(recorder, self._tick), timed=True, link=self._link)
-            self._reloader = reloader = Reloader(load, loop)
+            self._reloader = reloader = Reloader(lambda: self._read_again(load), loop)
+            if self._reload_first:
+                reloader.ask()
             if config.link.listen:
                 shows: Shows = {ShowParams: lambda _: dump_config(cast("Config", loop.params)).encode()}
-                self._stations = Stations(
-                    config.link, loop, reloader, devices.autopilot, devices.servos, save, shows
-                )
+                self._stations = Stations(config.link, loop, reloader, devices.autopilot, devices.servos, save, shows)
                 await asyncio.to_thread(self._stations.start)
             self._errand = Errand(loop.request, LONGEST) if self._options.mission else None
             devices.on_look = self._look
@@ -170,6 +172,12 @@ class _Flight:
             self._say(f"the log is incomplete: {recorder.error}")
         if recorder.dropped:
             self._say(f"{recorder.dropped} records were not written")
+
+    def _read_again(self, load: Callable[[], Config]) -> Config:
+        config = load()
+        if self._stations is not None:
+            self._stations.renew()
+        return config
 
     def _link(self) -> LinkState:
         return LinkState() if self._stations is None else self._stations.state()

@@ -107,8 +107,29 @@ class Link:
 
     def start(self) -> None:
         """Listen. Raises LinkError when that cannot be."""
+        self._open()
+        for thread in (self._events, self._answers, self._sender):
+            thread.start()
+
+    def reopen(self, security: ZenohConfig | None) -> None:
+        """Listen anew, with another security; all stations have to come again, and who commands goes on commanding.
+
+        Raises LinkError when that cannot be; it may be tried again. Nothing is done after ``stop``.
+        """
+        if self._closing.is_set():
+            return
+        old, self._session = self._session, None
+        if old is not None:
+            old.close()
+        self._security = security or {}
+        with self._lock:
+            self._sessions = Sessions()
+            self._hold(self._lease)
+        self._open()
+
+    def _open(self) -> None:
         settings, keys = self._settings, self._keys
-        self._session = session = open_session(
+        session = open_session(
             "router",
             settings.listen,
             plain=settings.plain,
@@ -116,25 +137,24 @@ class Link:
             security=self._security,
             more=_limits(keys),
         )
-        self._publish = partial(_put, session)
-        for thread in (self._events, self._answers, self._sender):
-            thread.start()
         for way in Way:
             session.declare_queryable(keys.stations(way), partial(self._hear_order, way))
         session.declare_subscriber(keys.stations("pulse"), self._hear_pulse)
         alive = session.liveliness()
         alive.declare_subscriber(keys.stations("alive"), self._hear_alive, history=True)
         self._token = alive.declare_token(keys.alive)
+        self._session = session
 
     def stop(self) -> None:
         """Send what waits, for a moment at most, and close; safe to call twice."""
-        session, self._session = self._session, None
-        if session is None:
+        if self._closing.is_set() or not self._sender.is_alive():
             return
         for outbox in (self._answers, self._events):
             outbox.close(_CLOSING)
         self._closing.set()
-        session.close()
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()
         self._sender.join(_CLOSING)
 
     # --- from the loop; no call waits ---------------------------------------------------------------------------------
@@ -304,6 +324,10 @@ class Link:
             self._answered.put(asked.station, ack)
         self._publish(self._keys.ack(asked.station), ack, _SURE)
 
+    def _publish(self, key: str, message: Struct, how: dict[str, Any]) -> None:
+        if (session := self._session) is not None:  # else it is being opened anew
+            session.put(key, encode(message), **how)
+
     def _failed(self, error: Exception) -> None:
         if not self._closing.is_set():
             self._teller.once("send", Level.ERROR, f"nothing can be sent: {type(error).__name__}: {error}")
@@ -324,10 +348,6 @@ _NEWEST: Final[dict[str, Any]] = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.DATA_LOW,
 }
-
-
-def _put(session: zenoh.Session, key: str, message: Struct, how: dict[str, Any]) -> None:
-    session.put(key, encode(message), **how)
 
 
 def _credible(stamp_ns: int, now: int) -> int:

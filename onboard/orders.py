@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Protocol, cast
+from typing import Any, Protocol
+
+from msgspec import Struct
 
 from onboard.config import Config
 from onboard.core.params import Params
@@ -25,7 +27,6 @@ from onboard.wire import (
     SetParams,
     Stop,
     Tare,
-    View,
 )
 
 _REFUSED = "refused_"
@@ -60,7 +61,7 @@ class _Emergency(Protocol):
 
 Settle = Callable[[Asked, Ack], None]
 #: What is shown for an order, as bytes; raises NotShownError.
-Shows = Mapping[type[View], Callable[[View], bytes]]
+Shows = Mapping[type[Struct], Callable[[Any], bytes]]
 
 
 class Orders:
@@ -113,12 +114,12 @@ class Orders:
         in_force = Layer("parameters in force", to_mapping(self._loop.params))
         return compose(Config, [in_force, *map(parse_set, values)])
 
-    def _shown(self, asked: Asked, ask: Ask) -> Ack:
-        show = self._shows.get(cast("type[View]", type(ask)))
+    def _shown(self, asked: Asked, ask: Struct) -> Ack:
+        show = self._shows.get(type(ask))
         if show is None:
             return asked.refused(f"this vehicle knows nothing of {type(ask).__name__}.")
         try:
-            return asked.done(data=show(cast("View", ask)))
+            return asked.done(data=show(ask))
         except NotShownError as error:
             return asked.refused(str(error))
 

@@ -42,7 +42,7 @@ def needs_restart(change: Change) -> bool:
 Done = Callable[[bool, Sequence[str]], None]
 
 
-class _Refusal(Exception):
+class _RefusedError(Exception):
     """The parameters stay as they are; one reason a line."""
 
     def __init__(self, reasons: Iterable[str]) -> None:
@@ -97,7 +97,7 @@ class Reloader:
             told, well = job(), True
         except ConfigError as error:
             told, well = error.errors, False
-        except (InfeasibleError, _Refusal) as error:
+        except (InfeasibleError, _RefusedError) as error:
             told, well = str(error).splitlines(), False
         except Exception as error:  # whatever is wrong with a file must not end a flight, nor go untold
             told, well = [f"{type(error).__name__}: {error}"], False
@@ -114,7 +114,7 @@ class Reloader:
             self._say("reload_unchanged", Severity.INFO, "Parameters read again: nothing differs.")
             return ["nothing differs"]
         if fixed := [change for change in changes if needs_restart(change)]:
-            raise _Refusal(f"{_told(change)}: takes a restart of the process" for change in fixed)
+            raise _RefusedError(f"{_told(change)}: takes a restart of the process" for change in fixed)
         settled = Flag()
         revisions: list[int | None] = []
 
@@ -127,7 +127,7 @@ class Reloader:
         settled.wait()
         (revision,) = revisions
         if revision is None:
-            raise _Refusal(f"{_told(change)}: may change on the ground only" for change in grounded)
+            raise _RefusedError(f"{_told(change)}: may change on the ground only" for change in grounded)
         for change in changes:
             self._say("reloaded", Severity.INFO, f"Parameters, revision {revision}: {_told(change)}.")
         return [f"revision {revision}", *map(_told, changes)]

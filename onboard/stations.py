@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from drivers.mailbox import Notice
+from drivers.mailbox import Level, Notice, Notices
 from drivers.protocols import AutopilotDevice, DeviceError, ServoDevice
 from onboard.admission import vehicle_security
 from onboard.core.params import Params
@@ -46,7 +47,9 @@ class Stations:
         self._ticked_ns = 0
         self._emergency = Emergency(autopilot, servos, loop.request, lambda: self._ticked_ns)
         orders = Orders(loop, reloader, self._emergency, lambda asked, ack: self.link.settle(asked, ack), save, shows)
-        self.link = Link(settings, orders, _security(settings))
+        self._settings, self._security = settings, _security(settings)
+        self.link = Link(settings, orders, self._security)
+        self._told = Notices()
 
     def start(self) -> None:
         """Open the link. Raises DeviceError when that cannot be."""
@@ -60,6 +63,21 @@ class Stations:
         """Send what waits, for a moment at most, and close."""
         self.link.stop()
         self._emergency.close()
+
+    def renew(self) -> None:
+        """Read keys and roster again; where they have changed, open the link anew. Takes time.
+
+        Raises ConfigError for what cannot be read, and has changed nothing then.
+        """
+        security = _security(self._settings)
+        if security == self._security:
+            return
+        try:
+            self.link.reopen(security)
+        except LinkError as error:
+            raise ConfigError([f"the link could not be opened anew: {error}; read the files again"]) from None
+        self._security = security
+        self._told.tell(time.monotonic_ns(), Level.INFO, "Keys or roster have changed: the link was opened anew.")
 
     def state(self) -> LinkState:
         """What is known of the station that commands."""
@@ -79,7 +97,7 @@ class Stations:
 
     def notices(self) -> tuple[Notice, ...]:
         """What link and emergency have had to tell since the last call."""
-        return (*self.link.notices(), *self._emergency.notices())
+        return (*self._told.take(), *self.link.notices(), *self._emergency.notices())
 
     def event(self, event: Event) -> None:
         """Tell of something that no tick tells of."""

@@ -232,7 +232,7 @@ class Told(Struct, frozen=True):
     event: Event
 
 
-# --- what is shown, in the data of an answer ---------------------------------------------------------------------------
+# --- what is shown, in the data of an answer --------------------------------------------------------------------------
 
 
 class Check(Struct, frozen=True):
