@@ -608,8 +608,12 @@ def test_opened_anew_all_come_again_and_who_commands_goes_on(vehicle: Vehicle, j
     vehicle.link.reopen(None)
     assert vehicle.link.state().commander == "alice"
     seconds_until(lambda: vehicle.link.state().present)
-    vehicle.link.event(event("anew"))
-    seconds_until(lambda: alice.events[-1].event.text == "anew")
+
+    def heard() -> bool:
+        vehicle.link.event(event("anew"))
+        return any(told.event.text == "anew" for told in alice.events)
+
+    seconds_until(heard)
     assert alice.ask(Mission(Request.HOLD), timeout=LONG).outcome is not Outcome.REFUSED
 
 
