@@ -107,7 +107,8 @@ class Client:
     """One session of a station with one vehicle. Use as a context manager, or close it.
 
     timeout: to find the vehicle, s. on_told: called with each event, on one of Zenoh's threads. security: Zenoh
-    configuration for TLS; empty without.
+    configuration for TLS; empty without. forbids: why something need not be asked, since the vehicle would not even
+    answer; empty when it may be.
     Raises LinkError for settings that cannot be, NoVehicleError when the vehicle is not there or does not admit us.
     """
 
@@ -118,8 +119,9 @@ class Client:
         timeout: float = 3.0,
         on_told: Callable[[Told], None] | None = None,
         security: ZenohConfig | None = None,
+        forbids: Callable[[Ask], str] | None = None,
     ) -> None:
-        self._settings, self._on_told = settings, on_told
+        self._settings, self._on_told, self._forbids = settings, on_told, forbids
         self.station = settings.station or default_name()
         self._session_name = uuid.uuid4().hex[:12]
         self._keys = _keys(settings.vehicle, self.station)
@@ -194,6 +196,8 @@ class Client:
         not answer within ``timeout`` seconds (then it may or may not do what was asked).
         """
         identity = uuid.uuid4().hex
+        if self._forbids is not None and (why := self._forbids(ask)):
+            return Ack(identity, Outcome.REFUSED, why)
         answers: SimpleQueue[Ack | None] = SimpleQueue()
         self._orders[identity] = answers
         end, due, accepted = time.monotonic() + timeout, 0.0, False
