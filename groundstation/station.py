@@ -16,12 +16,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
 from groundstation import codes
+from onboard.messages import Identity, IdentityError, load_identity, not_for, station_security
+from onboard.wire import Ack, Ask, Outcome, Told, Way, way_of
 
 if TYPE_CHECKING:
     from groundstation.client import Client, StationSettings
-    from onboard.messages import Identity
-    from onboard.wire import Ack, Ask, Told
 
 CONNECT, VEHICLE, KEYS = "PIPEWRIGHT_CONNECT", "PIPEWRIGHT_VEHICLE", "PIPEWRIGHT_KEYS"
 _VEHICLE: Final = "pipewright"
@@ -37,6 +39,10 @@ class WrongInputError(Exception):
 
 class RefusedError(Exception):
     """The vehicle refuses, or would; the text says why."""
+
+
+class UnfinishedError(Exception):
+    """It was begun as asked, and has ended otherwise; the text says how."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -82,8 +88,6 @@ def open_client(options: argparse.Namespace, *, on_told: Callable[[Told], None] 
     """
     from groundstation.client import Client
     from onboard.endpoints import NoVehicleError
-    from onboard.messages import IdentityError, not_for, station_security
-    from onboard.wire import way_of
 
     identity = _identity(options)
     settings = settings_of(options, identity)
@@ -121,8 +125,6 @@ def settings_of(options: argparse.Namespace, identity: Identity | None) -> Stati
 
 def _identity(options: argparse.Namespace) -> Identity | None:
     """Who this station is; None: it has no keys, or is not to use them."""
-    from onboard.messages import IdentityError, load_identity
-
     if options.plain:
         if options.keys is not None:
             raise WrongInputError("--plain and --keys: give one of them")
@@ -151,12 +153,30 @@ def _reasons(error: Exception, settings: StationSettings, identity: Identity | N
 
 def ask(client: Client, what: Ask, options: argparse.Namespace) -> Ack:
     """Ask, and give the answer that is final. Raises RefusedError, NoVehicleError, NoAnswerError."""
-    from onboard.wire import Outcome
-
     ack = client.ask(what, timeout=options.timeout, settled=True)
     if ack.outcome is Outcome.REFUSED:
         raise RefusedError(ack.text)
     return ack
+
+
+def command(client: Client, what: Ask, options: argparse.Namespace) -> Ack:
+    """As ``ask``, for what the commander alone may ask: a refusal says how to become it."""
+    try:
+        return ask(client, what, options)
+    except RefusedError as error:
+        raise RefusedError(f"{error}{_how_to_command(client, what)}") from None
+
+
+def _how_to_command(client: Client, what: Ask) -> str:
+    pulse = client.contact().pulse
+    if way_of(what) is not Way.COMMAND or pulse is None or pulse.commander == client.station:
+        return ""
+    if not pulse.commander:
+        return (
+            " Run `pipewright lease take` in another terminal and leave it running: the vehicle wants its commander to "
+            "be there all the time."
+        )
+    return " `pipewright lease take --seize` takes it from whoever has it."
 
 
 def tell(options: argparse.Namespace, text: str, **more: Any) -> None:
@@ -175,7 +195,6 @@ def tell_data(options: argparse.Namespace, data: Any, lines: Sequence[str]) -> N
 
 def jsonable(data: Any) -> Any:
     """The same of plain values; what is no finite number, and so no JSON, is null."""
-    import msgspec
 
     def finite(value: Any) -> Any:
         match value:
@@ -199,46 +218,35 @@ def guarded(run: Run) -> Run:
             return run(options)
         except KeyboardInterrupt:
             return codes.INTERRUPTED
-        except (WrongInputError, RefusedError) as error:
-            wrong = isinstance(error, WrongInputError)
-            return _failed(options, codes.WRONG_INPUT if wrong else codes.REFUSED, error)
         except Exception as error:
-            code = _code(error)
-            if code is None:
+            code, outcome = _judged(error)
+            if not outcome:
                 raise
-            return _failed(options, code, error)
+            if options.json:
+                tell_data(options, {"outcome": outcome, "text": str(error)}, [])
+            print(f"pipewright: {error}", file=sys.stderr)
+            return code
 
     return guarding
 
 
-_OUTCOMES: Final = {
-    codes.WRONG_INPUT: "wrong_input",
-    codes.REFUSED: "refused",
-    codes.NOT_THERE: "no_vehicle",
-    codes.TIMED_OUT: "timed_out",
-}
-
-
-def _code(error: Exception) -> int | None:
-    """The exit code of an error of the link; None: it is a fault of this program."""
+def _judged(error: Exception) -> tuple[int, str]:
+    """Exit code and outcome of what a command may raise; no outcome: it is a fault of this program."""
     from groundstation.client import NoAnswerError
     from onboard.endpoints import LinkError, NoVehicleError
 
     match error:
-        case LinkError():
-            return codes.WRONG_INPUT
+        case WrongInputError() | LinkError():
+            return codes.WRONG_INPUT, "wrong_input"
+        case RefusedError():
+            return codes.REFUSED, "refused"
+        case UnfinishedError():
+            return codes.REFUSED, "unfinished"
         case NoVehicleError():
-            return codes.NOT_THERE
+            return codes.NOT_THERE, "no_vehicle"
         case NoAnswerError():
-            return codes.TIMED_OUT
-    return None
-
-
-def _failed(options: argparse.Namespace, code: int, error: Exception) -> int:
-    if options.json:
-        print(json.dumps({"outcome": _OUTCOMES[code], "text": str(error)}, ensure_ascii=False), flush=True)
-    print(f"pipewright: {error}", file=sys.stderr)
-    return code
+            return codes.TIMED_OUT, "timed_out"
+    return codes.BROKEN, ""
 
 
 def _seconds(text: str) -> float:
