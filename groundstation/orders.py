@@ -1,4 +1,4 @@
-"""The commands that ask something of the mission: ``arm``, ``takeoff``, ``start``, ``hold``, ``kill``, and the others."""
+"""The commands that ask something of the mission: ``arm``, ``takeoff``, ``hold``, ``kill``, and the others."""
 
 from __future__ import annotations
 
