@@ -16,6 +16,7 @@ from threading import Event as Flag
 from threading import Lock, Thread
 from typing import Any, Final
 
+import msgspec
 import zenoh
 from msgspec import Struct
 
@@ -37,6 +38,7 @@ from onboard.wire import (
     Outcome,
     Place,
     ReleaseLease,
+    ShowEvents,
     TakeLease,
     Telemetry,
     Told,
@@ -53,6 +55,8 @@ from onboard.wire import (
 #: Messages that one station may send in a second, by the last part of their key. Who asks more often asks in vain.
 _RATES: Final = {Way.SAFETY: 100.0, Way.COMMAND: 50.0, Way.VIEW: 20.0, "pulse": 100.0}
 _EVENTS, _ANSWERS = 256, 256
+#: Events that are shown to who comes later: the newest.
+_REMEMBERED: Final = 50
 _CLOSING = 0.5
 
 
@@ -97,6 +101,7 @@ class Link:
         self._newest: Tick | None = None
         self._numbers = itertools.count(1)
         self._told = 0
+        self._recent: tuple[Told, ...] = ()
         self._notices = Notices()
         self._teller = Teller(self._notices, time.monotonic_ns, "link")
         self._closing = Flag()
@@ -167,7 +172,9 @@ class Link:
         """Tell all stations, at once; when too many wait, it is dropped and counted."""
         number = next(self._numbers)
         self._told = number
-        self._events.put(lambda: self._publish(self._keys.event, Told(number, event), _SURE))
+        told = Told(number, event)
+        self._recent = (*self._recent[1 - _REMEMBERED :], told)
+        self._events.put(lambda: self._publish(self._keys.event, told, _SURE))
 
     def settle(self, asked: Asked, ack: Ack) -> None:
         """What has become of an order that was accepted. Not to be called from within ``on_order``."""
@@ -223,7 +230,12 @@ class Link:
                     f"Too old: {station} had last heard the vehicle {since} when it sent this; "
                     f"at most {self._settings.order_age:g} s are allowed."
                 )
-            ack = self._rule(asked, now, heard) if way is Way.COMMAND else self._on_order(asked)
+            if way is Way.COMMAND:
+                ack = self._rule(asked, now, heard)
+            elif isinstance(asked.ask, ShowEvents):
+                ack = asked.done(data=msgspec.json.encode(self._recent))
+            else:
+                ack = self._on_order(asked)
             self._answered.put(station, ack)
             return ack
 

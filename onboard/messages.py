@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from onboard.admission import not_for, station_security
 from onboard.core.repair import Pipe, Repair
-from onboard.core.types import Event, Phase, Severity, Tick
+from onboard.core.types import Event, Phase, Request, Severity, Tick
 from onboard.identity import Identity, IdentityError, load_identity
 from onboard.logfile import LogError, LogReader
 from onboard.records import (
@@ -45,6 +45,7 @@ __all__ = [
     "Phase",
     "Pipe",
     "Repair",
+    "Request",
     "Revision",
     "Role",
     "Roster",

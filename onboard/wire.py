@@ -119,6 +119,10 @@ class ShowPreflight(Struct, frozen=True, tag=True):
     """The checklist."""
 
 
+class ShowEvents(Struct, frozen=True, tag=True):
+    """The newest events, as JSON of ``tuple[Told, ...]``, oldest first."""
+
+
 class ListLogs(Struct, frozen=True, tag=True):
     """The logs that the vehicle holds."""
 
@@ -132,7 +136,7 @@ class ReadLog(Struct, frozen=True, tag=True):
 
 
 Command = Mission | Stop | Go | Arm | Tare | SetParams | ReloadParams | SaveParams | TakeLease | ReleaseLease
-View = ShowParams | ShowPreflight | ListLogs | ReadLog
+View = ShowParams | ShowPreflight | ShowEvents | ListLogs | ReadLog
 Ask = Command | View
 
 
@@ -141,7 +145,7 @@ def way_of(ask: Ask) -> Way:
     match ask:
         case Stop() | Mission(request=Request.RETREAT | Request.KILL):
             return Way.SAFETY
-        case ShowParams() | ShowPreflight() | ListLogs() | ReadLog():
+        case ShowParams() | ShowPreflight() | ShowEvents() | ListLogs() | ReadLog():
             return Way.VIEW
     return Way.COMMAND
 
