@@ -163,7 +163,7 @@ def test_a_commander_that_is_silent_and_nobody_who_commands() -> None:
 
 def test_what_the_devices_say_against_arming_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
     """The very sentences of the devices: nothing of them may land in a row that says something else."""
-    devices = FlightDevices(CONFIG)
+    devices = FlightDevices(load_config("jetson"))
     px4 = devices._px4
     assert px4 is not None
     monkeypatch.setattr(px4, "parameter_differences", lambda: ("EKF2_EV_CTRL is 0, wants 15",))
