@@ -56,7 +56,7 @@ def test_a_cross_with_its_remedy(vessel: Vessel, port: int, capsys: pytest.Captu
     vessel.lists = [(LOW,)]
     assert run(preflight.add_parser, port, "preflight") == codes.REFUSED
     out = capsys.readouterr().out
-    assert "✗ battery  13.1 V, 8%" in out
+    assert "✗ battery 13.1 V, 8%" in out
     assert "→ Change it." in out
     assert "1 of 3 are not well: do not fly" in out
     assert vessel.asked == 1

@@ -221,6 +221,6 @@ def test_the_newest_lateness_counts() -> None:
     assert lateness.newest() is None
     for late in (0.5, *(1e-3 * k for k in range(100))):
         lateness.add(late)
-    late = lateness.newest()
-    assert late is not None
-    assert (late.p99, late.max) == pytest.approx((0.098, 0.099))
+    newest = lateness.newest()
+    assert newest is not None
+    assert (newest.p99, newest.max) == pytest.approx((0.098, 0.099))
