@@ -18,6 +18,7 @@ from onboard.core.params import Params
 from onboard.device_config import DeviceConfig
 from onboard.layers import ConfigError, Layer, parse_set, read_yaml
 from onboard.link_settings import LinkSettings
+from onboard.log_settings import LogSettings
 from onboard.params import compose, dump_yaml
 from onboard.scheduling import ProcessParams
 from sim_backend.faults import Fault
@@ -45,6 +46,7 @@ class Config(Params, frozen=True, kw_only=True):
     """What goes wrong with emulated devices."""
     devices: DeviceConfig = DeviceConfig()
     link: LinkSettings = LinkSettings()
+    logs: LogSettings = LogSettings()
     process: ProcessParams = ProcessParams()
 
 

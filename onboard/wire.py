@@ -258,9 +258,11 @@ class LogFile(Struct, frozen=True):
     size: int
     """Bytes."""
     sha256: str
-    """Hexadecimal; empty while the log is being written."""
+    """Hexadecimal; empty while it is not known: it is made once the log has been finished and somebody reads it."""
     modified_ns: int
     """UTC."""
+    writing: bool = False
+    """It is being recorded."""
 
 
 # --- bytes ------------------------------------------------------------------------------------------------------------
