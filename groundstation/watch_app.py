@@ -14,13 +14,13 @@ from textual.events import Key
 from groundstation import watch_words as words
 from groundstation.client import Contact
 from groundstation.watch_keys import QUIT, Hand, Leave
-from groundstation.watch_known import Knowledge
-from groundstation.watch_model import TREND, Model, View
+from groundstation.watch_marks import Line
+from groundstation.watch_model import TREND, Model, View, gathered
 from groundstation.watch_orders import Asker, LeaseKeeper, Orders
+from groundstation.watch_shown import Shown, read_events, read_known
 from groundstation.watch_widgets import Part, Scene
-from groundstation.watch_words import Line
 from onboard.messages import Action
-from onboard.wire import ReleaseLease, Telemetry, Told
+from onboard.wire import ReleaseLease, ShowEvents, ShowParams, Telemetry, Told
 
 _PERIOD: Final = 0.1
 #: The answer to an order is shown for this long, ns.
@@ -32,11 +32,9 @@ _NUMBERS, _ANSWERS = 2, 2
 class Source(Asker, Protocol):
     """What the screen needs of a client."""
 
+    vehicle: str
     station: str
-
-    @property
-    def vehicle(self) -> str:
-        """Its name."""
+    session: str
 
     @property
     def events(self) -> Collection[Told]:
@@ -57,8 +55,8 @@ class WatchApp(App[None]):
 
     TITLE = "pipewright watch"
     ENABLE_COMMAND_PALETTE = False
-    HORIZONTAL_BREAKPOINTS: ClassVar = [(0, "-narrow"), (76, "-wide")]
-    VERTICAL_BREAKPOINTS: ClassVar = [(0, "-short"), (34, "-tall")]
+    HORIZONTAL_BREAKPOINTS = [(0, "-narrow"), (76, "-wide")]  # noqa: RUF012  # declared so in App
+    VERTICAL_BREAKPOINTS = [(0, "-short"), (34, "-tall")]  # noqa: RUF012
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("ctrl+q,ctrl+c", "leave", priority=True, show=False),
         Binding("up", "scroll(-1)", show=False),
@@ -94,8 +92,9 @@ class WatchApp(App[None]):
     ) -> None:
         super().__init__()
         self._source, self._clock = source, clock
-        self._model, self._hand = Model(source.station), Hand()
-        self._knowledge = Knowledge(source, clock)
+        self._model, self._hand = Model(source.station, source.session), Hand()
+        self._known = Shown(source, ShowParams(), read_known, clock)
+        self._before = Shown(source, ShowEvents(), read_events, clock)
         self._orders = Orders(source, clock, timeout)
         self._lease = LeaseKeeper(self._orders) if lease else None
         self._view = View(clock(), source.station)
@@ -156,14 +155,14 @@ class WatchApp(App[None]):
         self._look()
 
     def _look(self) -> None:
-        source, knowledge = self._source, self._knowledge
+        source, known = self._source, self._known
         contact, now = source.contact(), self._clock()
-        before = self._view
-        self._view = view = self._model.look(
-            now, contact, source.telemetry(), tuple(source.events), knowledge.known, knowledge.why
-        )
+        events = gathered(self._before.value or (), tuple(source.events), contact.pulse)
+        before, view = self._view, self._model.look(now, contact, source.telemetry(), events, known.value, known.why)
+        self._view = view
         if view.tick is not None:
-            knowledge.look(view.parameters)
+            known.look(view.parameters)
+        self._before.look((view.parameters[0], contact.missed))
         if self._lease is not None and contact.pulse is not None:
             self._lease.look(view.commander, source.station, now)
         self._ring(before, view)

@@ -16,7 +16,8 @@ from typing import Final
 from msgspec import Struct
 
 from groundstation.client import Contact
-from onboard.messages import Action, Phase, Pipe, SafetyParams, Severity, Tick
+from groundstation.follow import GROUND
+from onboard.messages import Action, Pipe, SafetyParams, Severity, Tick
 from onboard.wire import Telemetry, Told, VehiclePulse
 
 #: A tick older than this is not live, s.
@@ -32,7 +33,8 @@ LATENESS, RATE = 10.0, 2.0
 #: Least force that fills the scale, N.
 SCALE: Final = 3.0
 _PULSES: Final = 300
-_GROUND: Final = (Phase.PREFLIGHT, Phase.STOPPED)
+#: An event is stamped no later than the newest pulse, but for what comes between two, ns.
+_AHEAD_NS: Final = 5_000_000_000
 
 
 class Link(StrEnum):
@@ -109,7 +111,7 @@ class View(Struct, frozen=True):
     @property
     def flying(self) -> bool:
         """By the newest tick, however old it is."""
-        return self.tick is not None and self.tick.outputs.phase not in _GROUND
+        return self.tick is not None and self.tick.outputs.phase not in GROUND
 
     @property
     def commander(self) -> str:
@@ -136,8 +138,8 @@ class View(Struct, frozen=True):
 class Model:
     """Remembers what came, as far back as it is shown."""
 
-    def __init__(self, station: str) -> None:
-        self._station = station
+    def __init__(self, station: str, session: str) -> None:
+        self._station, self._session = station, session
         self._pulse: VehiclePulse | None = None
         self._pulse_ns = 0
         """When it came."""
@@ -210,10 +212,9 @@ class Model:
         return max(0, now_ns - max(self._bounds) - tick.inputs.t_ns) * 1e-9
 
     def _unheard(self, silent: float) -> float:
-        """Of all sessions of our name, the one that is heard best counts: they command together."""
         stations = self._pulse.stations if self._pulse is not None else ()
-        held = [heard.held_ns for heard in stations if heard.name == self._station and heard.heard_ns]
-        return min(held) * 1e-9 + silent if held else math.inf
+        held = [heard.held_ns for heard in stations if heard.session == self._session and heard.heard_ns]
+        return held[0] * 1e-9 + silent if held else math.inf
 
     def _idle(self) -> float:
         if self._pulse is None or not self._pulse.tick_ns:
@@ -229,6 +230,16 @@ class Model:
         lasted = (last.inputs.t_ns - first.inputs.t_ns) * 1e-9
         rate = (last.index - first.index) / lasted if lasted > 0.0 else math.nan
         return Punctuality(rate, max(tick.inputs.dt for tick in self._ticks))
+
+
+def gathered(before: Sequence[Told], heard: Sequence[Told], pulse: VehiclePulse | None) -> tuple[Told, ...]:
+    """Events that the vehicle remembers and those that came, each once, oldest first.
+
+    What is stamped in the future is of before the vehicle's machine was restarted, and left out.
+    """
+    latest = pulse.sent_ns + _AHEAD_NS if pulse is not None else math.inf
+    known = {(told.event.t_ns, told.number): told for told in (*before, *heard) if told.event.t_ns <= latest}
+    return tuple(known[key] for key in sorted(known))
 
 
 def clearance(tip: tuple[float, float, float], pipe: Pipe) -> float:

@@ -10,9 +10,9 @@ from rich.text import Text
 from textual.events import Resize
 from textual.widgets import Static
 
+from groundstation.watch_marks import Line, Tone
 from groundstation.watch_model import View
 from groundstation.watch_orders import Order
-from groundstation.watch_words import Line, Tone
 
 #: Grey, red, green and yellow have their like among sixteen colours, and all but grey are bold where it matters.
 STYLES: Final = {

@@ -6,45 +6,23 @@ A tone is never the only sign: what is bad is also said, what is old also has it
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
-from enum import StrEnum
 from typing import Final
 
 from drivers.samples import SERVO_NAMES
-from groundstation.watch_model import SILENT, Force, Link, View, clearance
+from groundstation.watch_marks import Line, Span, Tone, ago, bar, cut, duration, faded, length, number, plot, wrapped
+from groundstation.watch_model import SILENT, Link, View, clearance
 from groundstation.watch_orders import Order
 from onboard.messages import CONDITIONS, Action, Phase, Severity
 from onboard.wire import Outcome
 
-
-class Tone(StrEnum):
-    """How words are meant."""
-
-    PLAIN = "plain"
-    STRONG = "strong"
-    LABEL = "label"
-    GOOD = "good"
-    WARN = "warn"
-    BAD = "bad"
-    STALE = "stale"
-    ESTIMATED = "estimated"
-    DESIRED = "desired"
-    LOUD = "loud"
-    """In the colours of the box it stands in."""
-
-
-Span = tuple[str, Tone]
-Line = tuple[Span, ...]
 P, T = Phase, Tone
 
 #: A sample of a device is old after this time, s.
 OLD: Final = 0.5
 #: Tip and pipe touch within this distance, m; for the word alone.
 _NEAR: Final = 0.001
-_BLOCKS: Final = " ▁▂▃▄▅▆▇█"
-_BARS: Final = " ▏▎▍▌▋▊▉█"
 _PHASES: Final = {
     P.PREFLIGHT: "on the ground",
     P.TAKEOFF: "taking off",
@@ -82,16 +60,16 @@ def head(view: View, vehicle: str, width: int) -> Line:
         outputs = view.tick.outputs
         name, words = outputs.phase.replace("_", " ").upper(), _PHASES.get(outputs.phase, "")
         phase = ((f"{name}  {outputs.phase_time:.1f} s", T.STRONG), (f"  {words}", T.PLAIN))
-        phase = _faded(phase) if view.stale else phase
+        phase = faded(phase) if view.stale else phase
     left: Line = ((f" {vehicle} ", T.LABEL), (" ", T.PLAIN), *phase)
     if view.tick is None:
         right: Span = ("", T.PLAIN)
     elif view.stale:
-        right = (f"○ {_old(view.age)} ", T.STALE)
+        right = (f"○ {ago(view.age)} ", T.STALE)
     else:
-        right = (f"● live, {_time(view.age)} ", T.GOOD)
-    left = _cut(left, width - len(right[0]) - 1)
-    return (*left, (" " * (width - _length(left) - len(right[0])), T.PLAIN), right)
+        right = (f"● live, {duration(view.age)} ", T.GOOD)
+    left = cut(left, width - len(right[0]) - 1)
+    return (*left, (" " * (width - length(left) - len(right[0])), T.PLAIN), right)
 
 
 def alarm(view: View) -> tuple[str, ...]:
@@ -101,24 +79,24 @@ def alarm(view: View) -> tuple[str, ...]:
         case Link.LOST:
             how = "" if view.contact.present else ", and it is not connected"
             return (
-                f"LINK LOST  nothing heard for {_time(view.silent)}{how}",
+                f"LINK LOST  nothing heard for {duration(view.silent)}{how}",
                 f"What is shown is old. {alone if view.flying else 'Is it on, and within reach?'}",
             )
         case Link.DEAF:
-            since = "" if math.isinf(view.unheard) else f" for {_time(view.unheard)}"
+            since = "" if math.isinf(view.unheard) else f" for {duration(view.unheard)}"
             return (f"THE VEHICLE DOES NOT HEAR US{since}", f"Orders may not reach it. {alone if view.flying else ''}")
     if view.idle:
         return (
-            f"THE VEHICLE'S LOOP STANDS STILL  no tick for {_time(view.idle)}",
+            f"THE VEHICLE'S LOOP STANDS STILL  no tick for {duration(view.idle)}",
             "Its autopilot is to hold or land by itself. Kill acts without the loop.",
         )
     slow = "SLOW LINK" if view.link is Link.SLOW else "OLD PICTURE" if view.tick is not None and view.stale else ""
-    return (f"{slow}  what is shown may be {_time(max(view.age, view.contact.age))} old",) if slow else ()
+    return (f"{slow}  what is shown may be {duration(max(view.age, view.contact.age))} old",) if slow else ()
 
 
 def loud(sentences: Sequence[str], width: int) -> tuple[Line, ...]:
     """Sentences as lines of a loud box, which has its own colours."""
-    return tuple(((line, T.LOUD),) for text in sentences for line in _wrapped(text, width, 3))
+    return tuple(((line, T.LOUD),) for text in sentences for line in wrapped(text, width, 3))
 
 
 def verdict(view: View, width: int) -> tuple[Line, ...]:
@@ -134,8 +112,8 @@ def verdict(view: View, width: int) -> tuple[Line, ...]:
         words = f"▲ {said.action.name}  {_sentence(view, first)}"
         if more:
             words += f" Also: {', '.join(code.replace('_', ' ') for code in more)}."
-        lines = tuple(((line, tone),) for line in _wrapped(words, width, 2))
-    return tuple(_faded(line) for line in lines) if view.stale else lines
+        lines = tuple(((line, tone),) for line in wrapped(words, width, 2))
+    return tuple(faded(line) for line in lines) if view.stale else lines
 
 
 def force(view: View, width: int) -> tuple[Line, ...]:
@@ -146,24 +124,19 @@ def force(view: View, width: int) -> tuple[Line, ...]:
     desired, estimated = outputs.reference.force, outputs.estimate.contact_force
     touching = "in contact" if outputs.estimate.in_contact else "free"
     numbers: Line = (
-        (f"{_number(estimated, '.2f')} N", T.ESTIMATED),
+        (f"{number(estimated, '.2f')} N", T.ESTIMATED),
         (" of ", T.LABEL),
         (f"{desired:.2f} N", T.DESIRED),
         (f" desired   {touching}", T.LABEL),
     )
-    lines = (numbers, _bar(desired, estimated, view.scale, width))
-    return tuple(_faded(line) for line in lines) if view.stale else lines
+    lines = (numbers, bar(desired, estimated, view.scale, width))
+    return tuple(faded(line) for line in lines) if view.stale else lines
 
 
 def trend(view: View, seconds: float, columns: int, rows: int) -> tuple[Line, ...]:
     """The force of the last ``seconds`` up to now: blocks are estimated, the line is desired, what is missing empty."""
-    slots = _slots(view.trend, view.now_ns, seconds, columns)
-    lines = []
-    for row in range(rows - 1, -1, -1):
-        cells = [_cell(slot, view.scale, row, rows) for slot in slots]
-        line = _joined(cells)
-        lines.append(_faded(line) if view.stale else line)
-    return tuple(lines)
+    lines = plot(view.trend, view.scale, view.now_ns, seconds, columns, rows)
+    return tuple(faded(line) for line in lines) if view.stale else lines
 
 
 def vehicle(view: View, rows: int) -> tuple[Line, ...]:
@@ -177,9 +150,9 @@ def vehicle(view: View, rows: int) -> tuple[Line, ...]:
     lines: list[Line] = [
         _row(
             "pitch",
-            flown(f"{_number(math.degrees(estimate.rpy[1]), '+.2f')}°"),
+            flown(f"{number(math.degrees(estimate.rpy[1]), '+.2f')}°"),
             ("   height ", T.LABEL),
-            seen(f"{_number(estimate.p_WB[2], '.2f')} m"),
+            seen(f"{number(estimate.p_WB[2], '.2f')} m"),
         ),
         _row("tip", *seen.all(_tip(view))),
     ]
@@ -198,23 +171,23 @@ def vehicle(view: View, rows: int) -> tuple[Line, ...]:
             critical = left < bounds.battery_critical or volts < bounds.battery_critical_voltage
             tone = T.BAD if critical else T.WARN if low else T.PLAIN
         word = "critical" if tone is T.BAD else "low" if tone is T.WARN else ""
-        charge = f"{_number(100 * left, '.0f')} %   {_number(volts, '.2f')} V"
+        charge = f"{number(100 * left, '.0f')} %   {number(volts, '.2f')} V"
         lines.append(_row("battery", flown(charge, tone), flown(f"   {word}", tone)))
         armed = "armed" if autopilot.armed else "disarmed"
         lines.append(_row("autopilot", flown(f"{autopilot.mode}, {armed}"), ("   ", T.PLAIN), flown.age()))
     lines.append(_row("loop", *_loop(view)))
-    roll, _, yaw = (_number(math.degrees(angle), "+.2f") for angle in estimate.rpy)
-    x, y, _ = (_number(p, "+.2f") for p in estimate.p_WB)
+    roll, _, yaw = (number(math.degrees(angle), "+.2f") for angle in estimate.rpy)
+    x, y, _ = (number(p, "+.2f") for p in estimate.p_WB)
     clipped = ", ".join(name.replace("_", " ") for name in view.tick.outputs.clipped)
     lines += [
         _row("roll", flown(f"{roll}°"), ("   yaw ", T.LABEL), flown(f"{yaw}°")),
         _row("place", seen(f"{x}, {y} m")),
-        _row("speed", seen(f"{_number(math.hypot(*estimate.v_WB), '.2f')} m/s")),
+        _row("speed", seen(f"{number(math.hypot(*estimate.v_WB), '.2f')} m/s")),
         _row("gate", (f"clips {clipped}", T.WARN) if clipped else ("clips nothing", T.PLAIN)),
         _row("parameters", (f"revision {view.tick.revision}", T.PLAIN)),
     ]
     del lines[rows:]
-    return tuple(_faded(line) for line in lines) if view.stale else tuple(lines)
+    return tuple(faded(line) for line in lines) if view.stale else tuple(lines)
 
 
 def arm(view: View) -> tuple[Line, ...]:
@@ -233,45 +206,48 @@ def arm(view: View) -> tuple[Line, ...]:
         hot = T.PLAIN
         if bounds is not None and not servos.temperature[i] <= bounds.temperature_warm:
             hot = T.WARN if servos.temperature[i] <= bounds.temperature_hot else T.BAD
-        angle = f"{_number(math.degrees(servos.position[i]), '+.1f')}°"
-        current, volts = f"{_number(servos.current[i], '+.2f')} A", f"{_number(servos.voltage[i], '.1f')}"
+        angle = f"{number(math.degrees(servos.position[i]), '+.1f')}°"
+        current, volts = f"{number(servos.current[i], '+.2f')} A", f"{number(servos.voltage[i], '.1f')}"
         error = f" ✗{servos.error[i]:#04x}" if servos.error[i] else " warm" if hot is T.WARN else " hot"
         lines.append(
             (
                 (f"{name.replace('theta_', 'theta '):<9}", T.LABEL),
                 device(f"{angle:>7}{current:>8}{volts:>6}"),
-                device(f"{_number(servos.temperature[i], '.0f') + '°C':>6}", hot),
+                device(f"{number(servos.temperature[i], '.0f') + '°C':>6}", hot),
                 device(error if servos.error[i] or hot is not T.PLAIN else "", T.BAD if servos.error[i] else hot),
             )
         )
-    return tuple(_faded(line) for line in lines) if view.stale else tuple(lines)
+    return tuple(faded(line) for line in lines) if view.stale else tuple(lines)
 
 
 def link(view: View) -> tuple[Line, ...]:
     """Who commands, how old each end's word of the other is, who else is there."""
     contact, pulse = view.contact, view.contact.pulse
     if view.commanding:
-        who: Span = (f"you ({view.station})", T.GOOD)
+        commander: Span = (f"you ({view.station})", T.GOOD)
     elif view.commander:
-        who = (f"{view.commander}, not you", T.PLAIN)
+        commander = (f"{view.commander}, not you", T.PLAIN)
     else:
-        who = ("nobody", T.WARN if view.flying else T.PLAIN)
+        commander = ("nobody", T.WARN if view.flying else T.PLAIN)
     lost = view.link is Link.LOST
     missed = contact.missed + (pulse.dropped if pulse is not None else 0)
     names = [heard.name for heard in pulse.stations if heard.present] if pulse is not None else []
-    others = ", ".join(f"{name} x{names.count(name)}" if names.count(name) > 1 else name for name in sorted(set(names)))
+    present = ", ".join(
+        f"{name} x{names.count(name)}" if names.count(name) > 1 else name for name in sorted(set(names))
+    )
     rows = (
-        _row("commander", who),
-        _row("stations", (others or "none", T.PLAIN)),
-        _row("round trip", (_time(contact.round_trip), T.PLAIN)),
+        _row("commander", commander),
+        _row("stations", (present or "none", T.PLAIN)),
+        _row("round trip", (duration(contact.round_trip), T.PLAIN)),
         _row("events", (f"{missed} lost" if missed else "none lost", T.WARN if missed else T.PLAIN)),
     )
     late = T.BAD if lost else T.WARN if contact.age > SILENT else T.PLAIN
     ages = (
-        _row("heard", (_old(contact.age), late)),
-        _row("hears us", (_old(view.unheard), T.BAD if view.unheard > SILENT else T.PLAIN)),
+        _row("heard", (ago(contact.age), late)),
+        _row("hears us", (ago(view.unheard), T.BAD if view.unheard > SILENT else T.PLAIN)),
     )
-    return (rows[0], *ages, *(_faded(row) if lost else row for row in rows[1:]))
+    who, *others = (faded(row) if lost else row for row in rows)
+    return (who, *ages, *others)
 
 
 def events(view: View, width: int, rows: int) -> tuple[Line, ...]:
@@ -281,7 +257,7 @@ def events(view: View, width: int, rows: int) -> tuple[Line, ...]:
         event = told.event
         mark, tone = _MARKS[event.severity]
         stamp = f"{_clock(view, event.t_ns)} "
-        words = _wrapped(f"{mark} {event.text}", width - len(stamp), rows, "  ")
+        words = wrapped(f"{mark} {event.text}", width - len(stamp), rows, "  ")
         first = ((stamp, T.LABEL), (words[0], tone))
         rest = [((" " * len(stamp) + more, tone),) for more in words[1:]]
         if lines and len(lines) + 1 + len(rest) > rows:
@@ -292,7 +268,7 @@ def events(view: View, width: int, rows: int) -> tuple[Line, ...]:
 
 def answers(orders: Sequence[Order], now_ns: int, width: int, rows: int) -> tuple[Line, ...]:
     """What became of the newest orders, the newest last."""
-    return tuple(_cut((_answer(order, now_ns),), width) for order in orders[-rows:])
+    return tuple(cut((_answer(order, now_ns),), width) for order in orders[-rows:])
 
 
 def keys(width: int) -> Line:
@@ -301,7 +277,7 @@ def keys(width: int) -> Line:
     spans: list[Span] = []
     for key, word in _KEYS:
         spans += [(f"{gap if spans else ' '}{key} ", T.STRONG), (word, T.BAD if word.isupper() else T.PLAIN)]
-    return _cut(tuple(spans), width)
+    return cut(tuple(spans), width)
 
 
 # --- words and marks --------------------------------------------------------------------------------------------------
@@ -322,7 +298,7 @@ class _Device:
 
     def age(self) -> Span:
         """How old the sample was at the tick."""
-        return (_old(self._age), T.BAD) if self.old else (_time(self._age), T.LABEL)
+        return (ago(self._age), T.BAD) if self.old else (duration(self._age), T.LABEL)
 
 
 def _tip(view: View) -> Iterator[Span]:
@@ -332,7 +308,7 @@ def _tip(view: View) -> Iterator[Span]:
         return
     estimate = view.tick.outputs.estimate
     off = clearance(estimate.tip_W, view.known.pipe)
-    words = f"{_number(1000 * off, '.1f')} mm" if abs(off) < 0.1 else f"{_number(off, '.2f')} m"
+    words = f"{number(1000 * off, '.1f')} mm" if abs(off) < 0.1 else f"{number(off, '.2f')} m"
     yield f"{words} from the pipe", T.STRONG if off <= _NEAR else T.PLAIN
 
 
@@ -357,7 +333,7 @@ def _sentence(view: View, code: str) -> str:
 
 
 def _answer(order: Order, now_ns: int) -> Span:
-    age = _time((now_ns - order.asked_ns) * 1e-9)
+    age = duration((now_ns - order.asked_ns) * 1e-9)
     text = order.text.removesuffix(".")
     match order.outcome:
         case None:
@@ -370,79 +346,8 @@ def _answer(order: Order, now_ns: int) -> Span:
             return f"✓ {order.name} {outcome}, {age} ago{': ' if text else ''}{text}", T.GOOD
 
 
-def _bar(desired: float, estimated: float, scale: float, width: int) -> Line:
-    """Blocks up to the estimated force, a mark at the desired one, the end of the scale beyond."""
-    end = f" {scale:g} N"
-    room = max(width - len(end), 1)
-    share = min(max(estimated / scale, 0.0), 1.0) if math.isfinite(estimated) else 0.0
-    eighths = round(share * room * 8)
-    cells: list[Span] = [(_BARS[min(max(eighths - 8 * i, 0), 8)], T.ESTIMATED) for i in range(room)]
-    cells = [("·", T.LABEL) if cell[0] == " " else cell for cell in cells]
-    if desired > 0.0:
-        cells[min(round(desired / scale * room), room - 1)] = ("┃", T.DESIRED)
-    return _joined([*cells, (end, T.LABEL)])
-
-
-def _slots(trend: Sequence[Force], now_ns: int, seconds: float, columns: int) -> list[Force | None]:
-    """The newest force of each column's time; columns end now."""
-    slots: list[Force | None] = [None] * columns
-    step = seconds / columns if columns else 1.0
-    for force in trend:
-        column = columns - 1 - math.floor((now_ns - force.seen_ns) * 1e-9 / step)
-        if 0 <= column < columns:
-            slots[column] = force
-    return slots
-
-
-def _cell(force: Force | None, scale: float, row: int, rows: int) -> Span:
-    """One character of the trend; row 0 is the lowest."""
-    if force is None:
-        return " ", T.PLAIN
-    if force.desired > 0.0 and row == min(math.floor(force.desired / scale * rows), rows - 1):
-        return "━", T.DESIRED
-    level = force.estimated / scale * rows * 8 if math.isfinite(force.estimated) else 0.0
-    return _BLOCKS[min(max(round(level) - 8 * row, 1 if row == 0 else 0), 8)], T.ESTIMATED
-
-
 def _row(label: str, *spans: Span) -> Line:
     return ((f"{label:<11}", T.LABEL), *spans)
-
-
-def _faded(line: Line) -> Line:
-    return tuple((text, T.STALE) for text, _ in line)
-
-
-def _joined(cells: Sequence[Span]) -> Line:
-    """Neighbours of one tone become one span."""
-    spans: list[Span] = []
-    for text, tone in cells:
-        if spans and spans[-1][1] is tone:
-            spans[-1] = (spans[-1][0] + text, tone)
-        else:
-            spans.append((text, tone))
-    return tuple(spans)
-
-
-def _length(line: Line) -> int:
-    return sum(len(text) for text, _ in line)
-
-
-def _cut(line: Line, width: int) -> Line:
-    """As much of a line as there is room for, an ellipsis for the rest."""
-    if _length(line) <= width:
-        return line
-    cut: list[Span] = []
-    room = max(width - 1, 0)
-    for text, tone in line:
-        cut.append((text[:room], tone))
-        room -= len(text[:room])
-    return (*cut, ("…", T.PLAIN))
-
-
-def _wrapped(text: str, width: int, rows: int, indent: str = "") -> list[str]:
-    return textwrap.wrap(text, max(width, 10), subsequent_indent=indent, max_lines=max(rows, 1), placeholder=" …") or [
-        ""
-    ]
 
 
 def _clock(view: View, t_ns: int) -> str:
@@ -453,21 +358,3 @@ def _clock(view: View, t_ns: int) -> str:
     offset = view.contact.clock_offset
     utc = (pulse.wall_ns - pulse.sent_ns + t_ns) * 1e-9 - (offset if math.isfinite(offset) else 0.0)
     return datetime.fromtimestamp(utc).astimezone().strftime("%H:%M:%S")
-
-
-def _time(seconds: float) -> str:
-    """A length of time, short."""
-    if not math.isfinite(seconds):
-        return "never"
-    for limit, factor, form, unit in ((0.0995, 1000.0, ".0f", "ms"), (9.95, 1.0, ".1f", "s"), (120.0, 1.0, ".0f", "s")):
-        if seconds < limit:
-            return f"{seconds * factor:{form}} {unit}"
-    return f"{seconds / 60:.0f} min"
-
-
-def _old(seconds: float) -> str:
-    return f"{_time(seconds)} ago" if math.isfinite(seconds) else "never"
-
-
-def _number(value: float, form: str) -> str:
-    return f"{value:{form}}" if math.isfinite(value) else "--"
