@@ -47,8 +47,10 @@ BRISK = (
 @pytest.fixture(scope="module")
 def folder() -> Iterator[Path]:
     """The run folder of ``pipewright desk``."""
-    with alone(), TemporaryDirectory(prefix="pipewright-") as name:
-        done = pipewright("desk", "--out", "run", *(f"--set={item}" for item in BRISK), cwd=Path(name), timeout=300.0)
+    with TemporaryDirectory(prefix="pipewright-") as name:
+        with alone():
+            sets = (f"--set={item}" for item in BRISK)
+            done = pipewright("desk", "--out", "run", *sets, cwd=Path(name), timeout=300.0)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "Traceback" not in done.stderr
         yield Path(name) / "run"

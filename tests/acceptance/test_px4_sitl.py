@@ -36,8 +36,9 @@ DOWN = ("land", "descend")
 @pytest.fixture(scope="module")
 def folder() -> Iterator[Path]:
     """The run folder of ``pipewright desk --config sitl``."""
-    with alone(), TemporaryDirectory(prefix="pipewright-") as name:
-        done = pipewright("desk", "--config", "sitl", "--out", "run", cwd=Path(name), timeout=400.0)
+    with TemporaryDirectory(prefix="pipewright-") as name:
+        with alone():
+            done = pipewright("desk", "--config", "sitl", "--out", "run", cwd=Path(name), timeout=400.0)
         assert done.returncode == 0, done.stdout + done.stderr
         yield Path(name) / "run"
 
