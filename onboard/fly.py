@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from math import inf
 from pathlib import Path
-from typing import cast
-
+from threading import Thread
 from msgspec import Struct
 
 from drivers.mailbox import Level
@@ -21,17 +21,18 @@ from onboard.cpu import CpuMeter
 from onboard.devices import FlightDevices
 from onboard.ending import Ending, hand_over, signals
 from onboard.errand import Errand
+from onboard.logs import Logs
 from onboard.loop import Loop
-from onboard.orders import Shows
 from onboard.params import Change
+from onboard.preflight import Lateness
 from onboard.recorder import Recorder
-from onboard.records import DeviceReport
+from onboard.records import DeviceReport, Timing
 from onboard.reload import Reloader
 from onboard.scheduling import Collector, ask
+from onboard.shown import Shown
 from onboard.simulate import run_info
 from onboard.stations import Stations
 from onboard.systemd import Notifier
-from onboard.wire import ShowParams
 from sim_backend.world_messages import Look
 
 #: A driver's notice as an event of the log.
@@ -40,6 +41,7 @@ _SEVERITY = {Level.INFO: Severity.INFO, Level.WARNING: Severity.WARNING, Level.E
 LONGEST = 900.0
 _REPORT_NS = 1_000_000_000
 _JOIN = 2.0
+_GB = 1e9
 
 
 class Options(Struct, frozen=True):
@@ -105,6 +107,9 @@ class _Flight:
         self._loop: Loop | None = None
         self._reloader: Reloader | None = None
         self._stations: Stations | None = None
+        self._shown: Shown | None = None
+        self._lateness = Lateness()
+        self._sentences: deque[str] = deque()
         self.began = False
         self._ready = self._reload_first = False
         self._report_ns = 0
@@ -140,14 +145,20 @@ class _Flight:
         info = run_info(config, realtime=True, started=datetime.now().astimezone().isoformat(timespec="seconds"))
         with Recorder(log, info, config, dump_config(config), t_ns=clock.now_ns(), background=True) as recorder:
             self._recorder = recorder
-            self._loop = loop = Loop(devices, clock, config, _Tee(recorder, self._tick), timed=True, link=self._link)
+            sink = _Tee(recorder, self._tick, self._lateness.add)
+            self._loop = loop = Loop(devices, clock, config, sink, timed=True, link=self._link)
             self._reloader = reloader = Reloader(lambda: self._read_again(load), loop)
             if self._reload_first:
                 reloader.ask()
+            logs = Logs(log.parent.absolute().parent, log.parent.name)
             if config.link.listen:
-                shows: Shows = {ShowParams: lambda _: dump_config(cast("Config", loop.params)).encode()}
-                self._stations = Stations(config.link, loop, reloader, devices.autopilot, devices.servos, save, shows)
-                await asyncio.to_thread(self._stations.start)
+                self._shown = shown = Shown(loop, recorder, logs, self._lateness, self._link, clock.now_ns)
+                stations = Stations(
+                    config.link, loop, reloader, devices.autopilot, devices.servos, save, shown.by_order()
+                )
+                await asyncio.to_thread(stations.start)
+                self._stations = stations
+            Thread(target=self._prune, args=(logs, config.logs.budget), name="prune", daemon=True).start()
             self._errand = Errand(loop.request, LONGEST) if self._options.mission else None
             devices.on_look = self._look
             self._cpu = CpuMeter()
@@ -185,6 +196,13 @@ class _Flight:
     def _tick(self, tick: Tick) -> None:
         if self._stations is not None:
             self._stations.tick(tick)
+        if self._shown is not None:
+            self._shown.tick = tick
+
+    def _prune(self, logs: Logs, budget: float) -> None:
+        """Make room for logs, however long that takes."""
+        for sentence in logs.prune(budget * _GB):
+            self._sentences.append(sentence)
 
     def _on_tick(self, outputs: Outputs) -> bool:
         now = self._clock.now_ns()
@@ -197,7 +215,10 @@ class _Flight:
         if now >= self._report_ns:
             self._report_ns = now + _REPORT_NS
             shares = {f"cpu.{part}": share for part, share in self._cpu.latest().items()}
-            self._recorder.devices(DeviceReport(now, self._devices.statistics() | shares))
+            statistics = self._devices.statistics() | shares
+            self._recorder.devices(DeviceReport(now, statistics))
+            if self._shown is not None:
+                self._shown.statistics = statistics
         self._collector.tick(outputs.phase)
         return goes_on
 
@@ -228,6 +249,8 @@ class _Flight:
             self._notifier.ready()
         for event in (*self.ending.events(now), *changes):
             self._tell(event)
+        while self._sentences:
+            self._tell(Event(now, "log", Severity.WARNING, self._sentences.popleft()))
         for code, trouble in (("log", self._recorder.trouble()), ("systemd", self._notifier.trouble())):
             if trouble:
                 self._tell(Event(now, code, Severity.ERROR, trouble))
@@ -251,14 +274,17 @@ class _Flight:
 class _Tee:
     """The recorder; of each tick, somebody else hears too."""
 
-    def __init__(self, recorder: Recorder, hear: Callable[[Tick], None]) -> None:
-        self._hear = hear
-        self._record = recorder.tick
-        self.keyframe, self.timing, self.revision = recorder.keyframe, recorder.timing, recorder.revision
+    def __init__(self, recorder: Recorder, hear: Callable[[Tick], None], hear_late: Callable[[float], None]) -> None:
+        self._recorder, self._hear, self._hear_late = recorder, hear, hear_late
+        self.keyframe, self.revision = recorder.keyframe, recorder.revision
 
     def tick(self, tick: Tick) -> None:
-        self._record(tick)
+        self._recorder.tick(tick)
         self._hear(tick)
+
+    def timing(self, timing: Timing) -> None:
+        self._recorder.timing(timing)
+        self._hear_late(timing.late)
 
 
 def _passes(outputs: Outputs) -> bool:
