@@ -9,6 +9,7 @@ from datetime import datetime
 from math import inf
 from pathlib import Path
 from threading import Thread
+
 from msgspec import Struct
 
 from drivers.mailbox import Level
