@@ -59,7 +59,7 @@ class Dynamixel:
     """ServoDevice on five XC330, real or emulated.
 
     ``clock`` gives nanoseconds and stamps the samples; ``port`` opens the port, now and after each loss. ``command``
-    and ``latest`` may be called from any one thread.
+    and ``latest`` may be called from any one thread, ``insist`` and ``latest`` from any.
     A servo that is lost in flight keeps its last values in the samples and shows ``HardwareError.SILENT``.
     """
 
@@ -89,6 +89,8 @@ class Dynamixel:
         self._wake = Event()
         self._late = 0
         self._command: tuple[ServoCommand, int] | None = None
+        self._off = False
+        self._off_due = False
         self._commanded_ns = 0
         self._left_silent = False
         self._reopen_ns = 0
@@ -139,6 +141,17 @@ class Dynamixel:
             self._teller.once("finite", Level.ERROR, "a command that is not finite was not sent")
             return
         self._command = (command, self._clock())
+        self._wake.set()
+
+    def insist(self, off: bool) -> None:
+        """From any thread: torque off in the bus's next packet, and off whatever is commanded, until False is given.
+
+        With each call the packet is sent again, whatever the servos tell: nothing answers it. Raises DeviceError
+        before ``start`` and after ``stop``.
+        """
+        if self._thread is None:
+            raise DeviceError("servo bus: insist() before start() or after stop()")
+        self._off_due = self._off = off
         self._wake.set()
 
     def notices(self) -> tuple[Notice, ...]:
@@ -232,6 +245,9 @@ class Dynamixel:
 
     def _turn(self, bus: Bus, command: ServoCommand | None) -> None:
         now = self._clock()
+        if self._off:
+            command = None
+            self._let_go(bus)
         if command is not None:
             self._commanded_ns = now
             self._left_silent = False
@@ -261,6 +277,16 @@ class Dynamixel:
             self._watch.count(error)
         self._cycle.add(self._clock() - now)
         self._watch.tend(bus, now)
+
+    def _let_go(self, bus: Bus) -> None:
+        """Torque off, if it is due or any servo has not taken it."""
+        if self._off_due or any(servo.engaged or servo.torque_on for servo in self._servos):
+            self._off_due = False
+            try:
+                self._goals.relax(bus)
+            except BusError as error:
+                self._off_due = True
+                self._teller.once("off", Level.ERROR, f"torque could not be switched off: {error}; trying again")
 
     def _leave_silent(self, quiet: float) -> None:
         if self._left_silent:
@@ -292,4 +318,5 @@ class Dynamixel:
             self._bus = Bus(self._port(settings.port, settings.baud, settings.reply_margin))
         except DeviceError:
             return
+        self._off_due = self._off
         self._teller.tell(Level.INFO, f"the adapter on {settings.port} is back")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from drivers.mailbox import Notice
-from drivers.samples import AutopilotCommand, AutopilotState, Odometry, ServoCommand, ServoState
+from drivers.samples import AutopilotCommand, AutopilotState, Engage, Odometry, ServoCommand, ServoState
 
 
 class Device(Protocol):
@@ -30,6 +30,14 @@ class AutopilotDevice(Device, Protocol):
     def command(self, command: AutopilotCommand) -> None:
         """Hand over one fresh set-point. It is sent at most once."""
 
+    def insist(self, engage: Engage | None) -> None:
+        """From any thread: this (KILL or LAND) is wanted from now on, whatever is commanded; None: no more.
+
+        It is asked for at once, by the calling thread, and again with each call. Meanwhile no set-point leaves and
+        nothing else is asked for, but a commanded KILL. Afterwards, what it has left is not taken back by itself: it
+        is as if a pilot had done it.
+        """
+
 
 class OdometryDevice(Device, Protocol):
     """The visual-inertial tracker."""
@@ -46,6 +54,12 @@ class ServoDevice(Device, Protocol):
 
     def command(self, command: ServoCommand) -> None:
         """Hand over the goals for the next cycle."""
+
+    def insist(self, off: bool) -> None:
+        """From any thread: torque off as soon as the bus is free, and off whatever is commanded; False: no more.
+
+        With each call it is switched off again.
+        """
 
 
 class DeviceError(Exception):

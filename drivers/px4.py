@@ -227,6 +227,10 @@ _ARM = _Ask("arming", _Command.ARM_DISARM, (1.0, 0.0))
 _DISARM = _Ask("disarming", _Command.ARM_DISARM, (0.0, 0.0))
 _KILL = _Ask("cutting the motors", _Command.ARM_DISARM, (0.0, _FORCE))
 
+#: What may be insisted on.
+_INSISTED = {Engage.KILL: _KILL, Engage.LAND: _LAND}
+_MOST_CONFIRMATIONS = 255
+
 # The heartbeat tells arming and mode. PX4 sends it once a second, whatever interval is asked for; but also on request.
 _HEARTBEAT = _Ask("a heartbeat", _Command.REQUEST_MESSAGE, (0.0,))
 
@@ -259,7 +263,7 @@ class Px4:
 
     ``clock`` gives nanoseconds; samples are stamped with it when they arrive. ``thrust`` is the thrust map where the
     settings hold none; with neither, ValueError. Construct it anywhere; ``start`` must run in the event loop in which
-    ``stop`` will run. ``command`` and ``latest`` may be called from any one thread.
+    ``stop`` will run. ``command`` and ``latest`` may be called from any one thread, ``insist`` and ``latest`` from any.
     """
 
     def __init__(
@@ -308,6 +312,8 @@ class Px4:
         self._intervals_due = False
 
         self._wanted: Engage | None = None
+        self._insisted: Engage | None = None
+        self._insistence = 0
         self._reached = False
         self._left = False
         self._seen: _Mode | None = None
@@ -464,6 +470,8 @@ class Px4:
             raise DeviceError("autopilot: command() before start() or after stop()")
         if command.interface is Interface.WRENCH:
             raise DeviceError("autopilot: PX4 accepts no body torques; set the interface to attitude or body_rate")
+        if self._insisted is not None and command.engage is not Engage.KILL:
+            return
         now = self._clock()
         if command.engage is not self._wanted:
             self._wanted, self._reached, self._left = command.engage, False, False
@@ -476,6 +484,23 @@ class Px4:
                 self._stream_began_ns = now
             self._commanded_ns = now
             self._send_set_point(command, now)
+
+    def insist(self, engage: Engage | None) -> None:
+        """From any thread: ask for KILL or LAND now, and want nothing else until None is given.
+
+        Nothing repeats it but another call, since the event loop may hang; the message counts these calls, as MAVLink
+        wants it. A heartbeat is asked for as well, so that ``latest`` soon tells whether PX4 has done it. ValueError
+        for any other state; DeviceError before ``start`` and after ``stop``.
+        """
+        if engage is not None and engage not in _INSISTED:
+            raise ValueError(f"autopilot: insist({engage.value}); want kill, land or None")
+        if self._direct is None:
+            raise DeviceError("autopilot: insist() before start() or after stop()")
+        self._insistence = self._insistence + 1 if engage is self._insisted else 0
+        self._insisted = engage
+        if engage is not None:
+            self._send("COMMAND_LONG", _command_json(_INSISTED[engage], min(self._insistence, _MOST_CONFIRMATIONS)))
+            self._send("COMMAND_LONG", _command_json(_HEARTBEAT))
 
     def odometry(self, sample: Odometry, position: float, attitude: float, velocity: float, quality: int) -> None:
         """Hand a pose to PX4's estimator, with the variances of position (m^2), attitude (rad^2), velocity (m^2/s^2).
@@ -600,7 +625,7 @@ class Px4:
             self._look_at_link()
             if self._wanted is Engage.KILL:
                 self._work_towards_kill()
-            elif (ask := self._next_ask()) is not None:
+            elif self._insisted is None and (ask := self._next_ask()) is not None:
                 self._begin(self._try(ask))
             if self._intervals_due and self._watch.linked and (self._tuning is None or self._tuning.done()):
                 self._intervals_due = False
@@ -877,12 +902,12 @@ def _parameter_json(name: str) -> str:
     return f'{{"target_system":{_SYSTEM},"target_component":{_AUTOPILOT},"param_id":"{name}","param_index":-1}}'
 
 
-def _command_json(ask: _Ask) -> str:
+def _command_json(ask: _Ask, confirmation: int = 0) -> str:
     fields: dict[str, float | int] = {
         "target_system": _SYSTEM,
         "target_component": _AUTOPILOT,
         "command": int(ask.command),
-        "confirmation": 0,
+        "confirmation": confirmation,
     }
     padded = (*ask.params, *(0.0,) * (7 - len(ask.params)))
     fields.update({f"param{i}": value for i, value in enumerate(padded, start=1)})

@@ -16,20 +16,34 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-from groundstation import calibrate, keys, params
+from groundstation import (
+    calibrate,
+    completion,
+    events,
+    keys,
+    lease,
+    logs,
+    orders,
+    params,
+    preflight,
+    status,
+    watch,
+)
+from groundstation.codes import BROKEN, DONE, INTERRUPTED, LOST, NOT_THERE, REFUSED, WRONG_INPUT
 from groundstation.desk import Desk, WorldError
+from groundstation.parsing import Parser
 
-COMPLETED, BROKEN, WRONG_INPUT, SAFE, LOST, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
-EXIT_CODES = {"completed": COMPLETED, "safe": SAFE, "unfinished": SAFE, "lost": LOST}
+EXIT_CODES = {"completed": DONE, "safe": REFUSED, "unfinished": REFUSED, "lost": LOST}
 
 _EPILOG = """\
 exit codes:
-  0  mission completed, or no difference in a replay
+  0  done; mission completed; no difference in a replay
   1  a replay differs, or the flight process failed
-  2  wrong input; nothing was written
-  3  ended safely, but not completed
+  2  wrong input; nothing was done or written
+  3  the vehicle refuses; or it ended safely, but otherwise than asked
   4  vehicle lost
-  5  a device cannot be had
+  5  no vehicle is there, or a device cannot be had
+  6  no answer in time: it may or may not be done
   130  interrupted; what was recorded until then is reported
 """
 _SIM_EPILOG = """\
@@ -58,7 +72,9 @@ _LOG_HELP = "log.mcap of a run, or its run folder"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; gives the exit code."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    completion.complete(parser)
+    options = parser.parse_args(arguments)
     try:
         code: int = options.run(options)
         sys.stdout.flush()
@@ -68,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         # Who read our output has seen enough; the interpreter must not complain of it at its end either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return COMPLETED
+        return DONE
     return code
 
 
@@ -78,7 +94,7 @@ class InputError(Exception):
 
 def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="pipewright",
         description="Pipe repair by contact with an aerial manipulator.",
         epilog=_EPILOG,
@@ -100,6 +116,7 @@ def _parser() -> argparse.ArgumentParser:
         "--config", dest="scenario", default="desk", metavar="NAME|FILE", help="devices, pipe, task (default: desk)"
     )
     desk.add_argument("--duration", type=float, metavar="SECONDS", help="land after this time")
+    desk.add_argument("--no-autostart", action="store_true", help="wait on the ground for what stations ask")
     desk.set_defaults(run=_desk)
     words = "fly with the devices of this machine: the process of the vehicle's computer"
     onboard = commands.add_parser(
@@ -133,9 +150,8 @@ def _parser() -> argparse.ArgumentParser:
     for command in (sim, desk, onboard):
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
-    calibrate.add_parser(commands)
-    params.add_parser(commands)
-    keys.add_parser(commands)
+    for group in (status, watch, preflight, lease, orders, events, params, logs, calibrate, keys, completion):
+        group.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")
     replay.add_argument("log", type=Path, metavar="LOG", help=_LOG_HELP)
@@ -170,7 +186,8 @@ def _sim(options: argparse.Namespace) -> int:
 def _desk(options: argparse.Namespace) -> int:
     begun, out = time.perf_counter(), _out(options)
     before = _written(out / "log.mcap")
-    arguments = ["--mission", "--out", str(out), *_run_options(options)]
+    mission = [] if options.no_autostart else ["--mission"]
+    arguments = [*mission, "--out", str(out), *_run_options(options)]
     try:
         with Desk(_common(options)) as desk:
             endpoints = desk.start_world()
@@ -179,7 +196,7 @@ def _desk(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         code = INTERRUPTED
     except WorldError as error:
-        if error.code not in (WRONG_INPUT, NO_DEVICE):
+        if error.code not in (WRONG_INPUT, NOT_THERE):
             print(f"pipewright: {error}", file=sys.stderr)
         code = error.code
     return _outcome(code, out / "log.mcap", before, begun)
@@ -220,13 +237,13 @@ def _outcome(code: int, log: Path, before: int, begun: float) -> int:
     if code == WRONG_INPUT:
         return WRONG_INPUT
     recorded = _written(log) != before
-    if code not in (COMPLETED, INTERRUPTED):
+    if code not in (DONE, INTERRUPTED):
         rest = "what it recorded is reported" if recorded else "it recorded nothing"
         print(f"pipewright: the flight process failed (code {code}); {rest}", file=sys.stderr)
     if not recorded:
-        return code if code in (INTERRUPTED, NO_DEVICE) else BROKEN
+        return code if code in (INTERRUPTED, NOT_THERE) else BROKEN
     outcome = _evaluate(log, partial=True, begun=begun)
-    return EXIT_CODES[outcome] if code == COMPLETED else INTERRUPTED if code == INTERRUPTED else BROKEN
+    return EXIT_CODES[outcome] if code == DONE else INTERRUPTED if code == INTERRUPTED else BROKEN
 
 
 def _replay(options: argparse.Namespace) -> int:
@@ -239,7 +256,7 @@ def _replay(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     beside = [_log(path) for path in options.beside]
     _evaluate(_log(options.log), partial=options.partial, beside=beside)
-    return COMPLETED
+    return DONE
 
 
 def _evaluate(log: Path, *, partial: bool, begun: float | None = None, beside: Sequence[Path] = ()) -> str:

@@ -107,7 +107,8 @@ class Client:
     """One session of a station with one vehicle. Use as a context manager, or close it.
 
     timeout: to find the vehicle, s. on_told: called with each event, on one of Zenoh's threads. security: Zenoh
-    configuration for TLS; empty without.
+    configuration for TLS; empty without. forbids: why something need not be asked, since the vehicle would not even
+    answer; empty when it may be.
     Raises LinkError for settings that cannot be, NoVehicleError when the vehicle is not there or does not admit us.
     """
 
@@ -118,10 +119,13 @@ class Client:
         timeout: float = 3.0,
         on_told: Callable[[Told], None] | None = None,
         security: ZenohConfig | None = None,
+        forbids: Callable[[Ask], str] | None = None,
     ) -> None:
-        self._settings, self._on_told = settings, on_told
+        self._settings, self._on_told, self._forbids = settings, on_told, forbids
+        self.vehicle = settings.vehicle
         self.station = settings.station or default_name()
-        self._session_name = uuid.uuid4().hex[:12]
+        self.session = uuid.uuid4().hex[:12]
+        """Name of this session among those of the station."""
         self._keys = _keys(settings.vehicle, self.station)
         self._changed = Condition()
         self._present = False
@@ -194,6 +198,8 @@ class Client:
         not answer within ``timeout`` seconds (then it may or may not do what was asked).
         """
         identity = uuid.uuid4().hex
+        if self._forbids is not None and (why := self._forbids(ask)):
+            return Ack(identity, Outcome.REFUSED, why)
         answers: SimpleQueue[Ack | None] = SimpleQueue()
         self._orders[identity] = answers
         end, due, accepted = time.monotonic() + timeout, 0.0, False
@@ -239,7 +245,7 @@ class Client:
 
         way = way_of(order.ask)
         self._session.get(
-            self._keys.station(self.station, self._session_name, way),
+            self._keys.station(self.station, self.session, way),
             zenoh.handlers.Callback(hear, end),
             payload=encode(order),
             timeout=timeout,
@@ -269,7 +275,7 @@ class Client:
         session.declare_subscriber(keys.ack(self.station), self._reading(read_ack, self._hear_ack))
         liveliness = session.liveliness()
         liveliness.declare_subscriber(keys.alive, self._hear_alive, history=True)
-        self._token = liveliness.declare_token(keys.station(self.station, self._session_name, "alive"))
+        self._token = liveliness.declare_token(keys.station(self.station, self.session, "alive"))
         self._sender.start()
 
     def _reading(self, read: Callable[[bytes], T], hear: Callable[[T], None]) -> Callable[[zenoh.Sample], None]:
@@ -288,7 +294,7 @@ class Client:
         with self._changed:
             self._pulse = pulse
             for heard in pulse.stations:
-                if heard.session == self._session_name and 0 < heard.heard_ns <= now:
+                if heard.session == self.session and 0 < heard.heard_ns <= now:
                     self._echo_ns = max(self._echo_ns, heard.heard_ns)
                     trip = max(0, now - heard.heard_ns - heard.held_ns)
                     self._trips.append((trip, pulse.wall_ns - wall + trip // 2))
@@ -320,7 +326,7 @@ class Client:
         return Contact(self._present, age, trip * 1e-9, offset * 1e-9, self._missed, self._pulse)
 
     def _send_pulses(self) -> None:
-        key = self._keys.station(self.station, self._session_name, "pulse")
+        key = self._keys.station(self.station, self.session, "pulse")
         while not self._closing.is_set():
             pulse = StationPulse(time.monotonic_ns(), self._pulse.sent_ns if self._pulse else 0)
             with suppress(zenoh.ZError):  # closed, or out of reach, which the age of the contact tells

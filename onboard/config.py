@@ -17,6 +17,8 @@ from msgspec import Meta
 from onboard.core.params import Params
 from onboard.device_config import DeviceConfig
 from onboard.layers import ConfigError, Layer, parse_set, read_yaml
+from onboard.link_settings import LinkSettings
+from onboard.log_settings import LogSettings
 from onboard.params import compose, dump_yaml
 from onboard.scheduling import ProcessParams
 from sim_backend.faults import Fault
@@ -43,6 +45,8 @@ class Config(Params, frozen=True, kw_only=True):
     faults: tuple[Fault, ...] = ()
     """What goes wrong with emulated devices."""
     devices: DeviceConfig = DeviceConfig()
+    link: LinkSettings = LinkSettings()
+    logs: LogSettings = LogSettings()
     process: ProcessParams = ProcessParams()
 
 

@@ -33,6 +33,10 @@ class NoVehicleError(Exception):
     """The vehicle cannot be reached; the text says what to look at."""
 
 
+class UnreachableError(NoVehicleError):
+    """Nobody could even be connected to."""
+
+
 class LinkError(Exception):
     """The link cannot be opened as asked; the text says where and what would be right."""
 
@@ -66,7 +70,7 @@ def open_session(
 
     lease: after which a silent peer is gone, s. security: configuration for TLS and access control, empty without.
     timeout: how long a client tries to connect, s. more: further configuration.
-    Raises LinkError, NoVehicleError when a client finds nobody in time.
+    Raises LinkError, UnreachableError when a client finds nobody in time.
     """
     if wrong := list(unfit(endpoints, plain=plain, secured=bool(security))):
         raise LinkError("\n".join(wrong))
@@ -87,7 +91,7 @@ def open_session(
     except zenoh.ZError as error:
         where = ", ".join(endpoints)
         if "Unable to connect" in str(error):
-            raise NoVehicleError(f"nothing lets us in at {where} within {timeout:g} s: is the vehicle on?") from None
+            raise UnreachableError(f"nothing lets us in at {where} within {timeout:g} s: is the vehicle on?") from None
         # Zenoh appends where in its sources it happened.
         reason = re.sub(r" at \S+\.rs:\d+\.?|\[|\]", "", str(error))
         raise LinkError(f"{where}: {reason}") from None

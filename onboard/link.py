@@ -16,13 +16,14 @@ from threading import Event as Flag
 from threading import Lock, Thread
 from typing import Any, Final
 
+import msgspec
 import zenoh
 from msgspec import Struct
 
 from drivers.mailbox import Level, Notice, Notices, Teller
 from onboard import lease as leases
 from onboard.core.mission import GROUND
-from onboard.core.types import Event, Tick
+from onboard.core.types import Event, LinkState, Tick
 from onboard.endpoints import ZenohConfig, open_session
 from onboard.lease import Lease, Watch
 from onboard.link_settings import LinkSettings
@@ -37,6 +38,7 @@ from onboard.wire import (
     Outcome,
     Place,
     ReleaseLease,
+    ShowEvents,
     TakeLease,
     Telemetry,
     Told,
@@ -53,22 +55,9 @@ from onboard.wire import (
 #: Messages that one station may send in a second, by the last part of their key. Who asks more often asks in vain.
 _RATES: Final = {Way.SAFETY: 100.0, Way.COMMAND: 50.0, Way.VIEW: 20.0, "pulse": 100.0}
 _EVENTS, _ANSWERS = 256, 256
+#: Events that are shown to who comes later: the newest.
+_REMEMBERED: Final = 50
 _CLOSING = 0.5
-
-
-class LinkState(Struct, frozen=True, gc=False):
-    """What the core needs to know of the link: facts, on the clock of the ticks."""
-
-    commander: str = ""
-    """Name of the station that commands; empty: nobody does."""
-    heard_ns: int = 0
-    """What was last heard of it was certainly sent after this time."""
-    present: bool = False
-    """It is connected. It is not once it has closed or died, or was frozen or out of reach for the peer lease."""
-
-    def age(self, t_ns: int) -> float:
-        """Time since the commander was certainly there, s; 0 when nobody commands."""
-        return max(0, t_ns - self.heard_ns) * 1e-9 if self.commander else 0.0
 
 
 class Asked(Struct, frozen=True):
@@ -112,6 +101,7 @@ class Link:
         self._newest: Tick | None = None
         self._numbers = itertools.count(1)
         self._told = 0
+        self._recent: tuple[Told, ...] = ()
         self._notices = Notices()
         self._teller = Teller(self._notices, time.monotonic_ns, "link")
         self._closing = Flag()
@@ -122,8 +112,29 @@ class Link:
 
     def start(self) -> None:
         """Listen. Raises LinkError when that cannot be."""
+        self._open()
+        for thread in (self._events, self._answers, self._sender):
+            thread.start()
+
+    def reopen(self, security: ZenohConfig | None) -> None:
+        """Listen anew, with another security; all stations have to come again, and who commands goes on commanding.
+
+        Raises LinkError when that cannot be; it may be tried again. Nothing is done after ``stop``.
+        """
+        if self._closing.is_set():
+            return
+        old, self._session = self._session, None
+        if old is not None:
+            old.close()
+        self._security = security or {}
+        with self._lock:
+            self._sessions = Sessions()
+            self._hold(self._lease)
+        self._open()
+
+    def _open(self) -> None:
         settings, keys = self._settings, self._keys
-        self._session = session = open_session(
+        session = open_session(
             "router",
             settings.listen,
             plain=settings.plain,
@@ -131,25 +142,24 @@ class Link:
             security=self._security,
             more=_limits(keys),
         )
-        self._publish = partial(_put, session)
-        for thread in (self._events, self._answers, self._sender):
-            thread.start()
         for way in Way:
             session.declare_queryable(keys.stations(way), partial(self._hear_order, way))
         session.declare_subscriber(keys.stations("pulse"), self._hear_pulse)
         alive = session.liveliness()
         alive.declare_subscriber(keys.stations("alive"), self._hear_alive, history=True)
         self._token = alive.declare_token(keys.alive)
+        self._session = session
 
     def stop(self) -> None:
         """Send what waits, for a moment at most, and close; safe to call twice."""
-        session, self._session = self._session, None
-        if session is None:
+        if self._closing.is_set() or not self._sender.is_alive():
             return
         for outbox in (self._answers, self._events):
             outbox.close(_CLOSING)
         self._closing.set()
-        session.close()
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()
         self._sender.join(_CLOSING)
 
     # --- from the loop; no call waits ---------------------------------------------------------------------------------
@@ -162,7 +172,9 @@ class Link:
         """Tell all stations, at once; when too many wait, it is dropped and counted."""
         number = next(self._numbers)
         self._told = number
-        self._events.put(lambda: self._publish(self._keys.event, Told(number, event), _SURE))
+        told = Told(number, event)
+        self._recent = (*self._recent[1 - _REMEMBERED :], told)
+        self._events.put(lambda: self._publish(self._keys.event, told, _SURE))
 
     def settle(self, asked: Asked, ack: Ack) -> None:
         """What has become of an order that was accepted. Not to be called from within ``on_order``."""
@@ -218,7 +230,12 @@ class Link:
                     f"Too old: {station} had last heard the vehicle {since} when it sent this; "
                     f"at most {self._settings.order_age:g} s are allowed."
                 )
-            ack = self._rule(asked, now, heard) if way is Way.COMMAND else self._on_order(asked)
+            if way is Way.COMMAND:
+                ack = self._rule(asked, now, heard)
+            elif isinstance(asked.ask, ShowEvents):
+                ack = asked.done(data=msgspec.json.encode(self._recent))
+            else:
+                ack = self._on_order(asked)
             self._answered.put(station, ack)
             return ack
 
@@ -319,6 +336,10 @@ class Link:
             self._answered.put(asked.station, ack)
         self._publish(self._keys.ack(asked.station), ack, _SURE)
 
+    def _publish(self, key: str, message: Struct, how: dict[str, Any]) -> None:
+        if (session := self._session) is not None:  # else it is being opened anew
+            session.put(key, encode(message), **how)
+
     def _failed(self, error: Exception) -> None:
         if not self._closing.is_set():
             self._teller.once("send", Level.ERROR, f"nothing can be sent: {type(error).__name__}: {error}")
@@ -339,10 +360,6 @@ _NEWEST: Final[dict[str, Any]] = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.DATA_LOW,
 }
-
-
-def _put(session: zenoh.Session, key: str, message: Struct, how: dict[str, Any]) -> None:
-    session.put(key, encode(message), **how)
 
 
 def _credible(stamp_ns: int, now: int) -> int:

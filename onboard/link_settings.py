@@ -26,6 +26,7 @@ class LinkSettings(Struct, frozen=True, forbid_unknown_fields=True):
         _note("where stations connect to: tls/0.0.0.0:7447, or tcp/127.0.0.1:7447 on one machine; none: no link"),
     ] = ()
     plain: Annotated[bool, _note("allow endpoints without TLS, on loopback only")] = False
+    keys: Annotated[str, _note("folder with the vehicle's identity and roster; empty: none, and plain is needed")] = ""
     telemetry_rate: Annotated[float, _meta("Hz", 0.1, 100.0, "at which the newest tick is sent")] = 20.0
     pulse_period: Annotated[float, _meta("s", 0.02, 1.0, "between two signs of life")] = 0.1
     peer_lease: Annotated[

@@ -12,7 +12,7 @@ from onboard.core.derived import Derived, adopt, derive
 from onboard.core.mission import GROUND
 from onboard.core.params import Params
 from onboard.core.step import State, initial_state, step
-from onboard.core.types import Inputs, Outputs, Request, Tick
+from onboard.core.types import Inputs, LinkState, Outputs, Phase, Request, Tick
 from onboard.records import Timing
 
 KEYFRAME_PERIOD_NS = 1_000_000_000
@@ -48,6 +48,12 @@ class Sink(Protocol):
         """Take the parameter set that is in force from the tick of this index on."""
 
 
+class _Asked(NamedTuple):
+    request: Request
+    go: Phase | None = None
+    done: Callable[[Outputs], None] | None = None
+
+
 class _Reload(NamedTuple):
     derived: Derived
     grounded: bool
@@ -57,17 +63,25 @@ class _Reload(NamedTuple):
 class Loop:
     """Runs the core at ``rate_hz`` on a clock.
 
-    timed: report each tick's lateness to the sink (wall-clock runs).
+    timed: report each tick's lateness to the sink (wall-clock runs). link: what is known of the ground station.
     """
 
     def __init__(
-        self, devices: Devices, clock: Clock, params: Params, sink: Sink, *, rate_hz: float = 250.0, timed: bool = False
+        self,
+        devices: Devices,
+        clock: Clock,
+        params: Params,
+        sink: Sink,
+        *,
+        rate_hz: float = 250.0,
+        timed: bool = False,
+        link: Callable[[], LinkState] = LinkState,
     ) -> None:
         derive(params)  # model, places and compiled code are ready before the first tick
         self._devices, self._clock, self._params, self._sink = devices, clock, params, sink
         self._period_ns = round(1e9 / rate_hz)
-        self._timed = timed
-        self._requests: deque[Request] = deque()
+        self._timed, self._link = timed, link
+        self._requests: deque[_Asked] = deque()
         self._reloads: deque[_Reload] = deque()
         self._state = initial_state(params)
         self.revision = 0
@@ -78,9 +92,14 @@ class Loop:
         """The parameter set in force."""
         return self._params
 
-    def request(self, request: Request) -> None:
-        """Ask something of the mission; taken one a tick, in order."""
-        self._requests.append(request)
+    def request(
+        self, request: Request, *, go: Phase | None = None, done: Callable[[Outputs], None] | None = None
+    ) -> None:
+        """Ask something of the mission; taken one a tick, in order; from any thread.
+
+        go: where to, of a GO. done: called by the loop with what came of the tick that took the request.
+        """
+        self._requests.append(_Asked(request, go, done))
 
     def reload(self, derived: Derived, *, grounded: bool, done: Callable[[int | None], None]) -> None:
         """Put another parameter set into force between two ticks; from any thread.
@@ -103,14 +122,17 @@ class Loop:
             now = clock.now_ns()
             while self._reloads:
                 self._put_into_force(self._reloads.popleft(), index, now)
+            asked = self._requests.popleft() if self._requests else None
             inputs = Inputs(
                 now,
                 (now - last) * 1e-9 if index else period * 1e-9,
                 devices.odometry.latest(),
                 devices.autopilot.latest(),
                 devices.servos.latest(),
-                self._requests.popleft() if self._requests else None,
+                asked.request if asked else None,
                 devices.obstacles(),
+                asked.go if asked else None,
+                self._link(),
             )
             before = state
             state, outputs = step(state, inputs, self._params, inputs.dt)
@@ -126,6 +148,8 @@ class Loop:
                 late, busy = (now - due) * 1e-9, (clock.now_ns() - now) * 1e-9
                 sink.timing(Timing(index, now, late, busy, (sent - now) * 1e-9))
             self._state, self.outputs = state, outputs
+            if asked and asked.done:
+                asked.done(outputs)
             if not on_tick(outputs):
                 return
             last = now

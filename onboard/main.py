@@ -15,6 +15,7 @@ from typing import Any
 
 from drivers.protocols import DeviceError
 from onboard.config import Config, dump_config, load_config
+from onboard.core.params import Params
 from onboard.core.plan import InfeasibleError
 from onboard.core.types import Outputs, Phase
 from onboard.layers import ConfigError
@@ -145,14 +146,21 @@ def _fly(options: argparse.Namespace) -> int:
     from onboard.core.derived import check_mission
     from onboard.devices import check_devices
     from onboard.fly import Options, fly
+    from onboard.param_file import Change, save_in_force
     from onboard.scheduling import event_loop
+    from onboard.stations import check_link
 
     def load() -> Config:
         return load_config(options.scenario, options.law, options.sets, options.seed, option="--config")
 
+    def save(params: Params) -> Sequence[Change]:
+        assert isinstance(params, Config)
+        return save_in_force(options.scenario, load(), params)
+
     config = load()
     check_devices(config)
     check_mission(config)
+    check_link(config.link)
     progress = Progress(not options.no_progress and sys.stderr.isatty())
 
     def say(text: str) -> None:
@@ -161,7 +169,7 @@ def _fly(options: argparse.Namespace) -> int:
     how = Options(options.mission, options.duration, options.attended)
     try:
         with asyncio.Runner(loop_factory=event_loop) as runner:
-            flown = runner.run(fly(config, lambda: _folder(config, options.out), how, load, progress, say))
+            flown = runner.run(fly(config, lambda: _folder(config, options.out), how, load, save, progress, say))
     finally:
         progress.close()
     return 0 if flown else INTERRUPTED

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from onboard.admission import not_for, station_security
 from onboard.core.repair import Pipe, Repair
-from onboard.core.types import Event, Phase, Severity, Tick
+from onboard.core.safety import WORDS as CONDITIONS
+from onboard.core.safety import Params as SafetyParams
+from onboard.core.types import Action, Event, Phase, Request, Severity, Tick
 from onboard.identity import Identity, IdentityError, load_identity
 from onboard.logfile import LogError, LogReader
 from onboard.records import (
@@ -26,6 +28,7 @@ from onboard.wire import NAME_RULE, is_name
 from sim_backend.plant import Truth
 
 __all__ = [
+    "CONDITIONS",
     "DEVICES",
     "EVENT",
     "KEYFRAME",
@@ -34,6 +37,7 @@ __all__ = [
     "TICK",
     "TIMING",
     "TRUTH",
+    "Action",
     "DeviceReport",
     "Event",
     "Identity",
@@ -45,11 +49,13 @@ __all__ = [
     "Phase",
     "Pipe",
     "Repair",
+    "Request",
     "Revision",
     "Role",
     "Roster",
     "RosterError",
     "RunInfo",
+    "SafetyParams",
     "Severity",
     "Tick",
     "Timing",

@@ -8,11 +8,11 @@ from typing import Any, Final
 
 from msgspec.structs import replace
 
-from onboard.config import CONFIGS, Config, load_config
-from onboard.declared import to_mapping
-from onboard.layers import ConfigError, Key, parse_yaml, show
+from onboard.config import CONFIGS, Config, law_names, load_config, scenario_names
+from onboard.declared import describe, to_mapping
+from onboard.layers import ConfigError, Key, Layer, parse_yaml, show
 from onboard.param_table import Entry, entries, find
-from onboard.params import Change, diff
+from onboard.params import Change, compose, diff
 from onboard.yaml_edit import Candidate, edited
 
 #: These choose further files, by which others differ: they are written first, and then what still differs.
@@ -20,7 +20,18 @@ _CHOOSE: Final = ("law", "interface", "joints")
 _ROUNDS: Final = 3
 #: In the folder of a run.
 RUN_CONFIG: Final = "config.yaml"
-__all__ = ["Change", "ConfigError", "Entry", "ParameterFile", "save"]
+__all__ = [
+    "Change",
+    "ConfigError",
+    "Entry",
+    "ParameterFile",
+    "ParameterText",
+    "law_names",
+    "parameter_names",
+    "save",
+    "save_in_force",
+    "scenario_names",
+]
 
 
 class ParameterFile:
@@ -34,12 +45,12 @@ class ParameterFile:
 
     def find(self, names: Sequence[str]) -> tuple[Entry, ...]:
         """Parameters, elements of them, or all of a group, by their names; without names, all."""
-        config = self._load(self._given)
+        config = self.load()
         return find(config, names) if names else entries(config)
 
     def put(self, sets: Sequence[str]) -> tuple[Change, ...]:
         """Write values, each given as ``name.of.parameter=value``, into the file; gives what is changed by them."""
-        path = self._path()
+        path = self.path()
         named = [(text.partition("=")[0].strip(), text) for text in sets]
         others = [text for name, text in named if name != "law"]
         law = next((text.partition("=")[2].strip() for name, text in reversed(named) if name == "law"), None)
@@ -47,26 +58,79 @@ class ParameterFile:
 
     def differences(self, other: str | None) -> tuple[Change, ...]:
         """From the other configuration to this one; without another, from the defaults."""
-        mine = self._load(self._given)
-        base = Config(vehicle=self._load("paper").vehicle) if other is None else self._load(other)
-        return tuple(diff(replace(base, scenario=mine.scenario), mine))
+        return _differences(self.load(), other, self._directory)
 
     def save(self, other: str) -> tuple[Change, ...]:
         """Make the file give what the other configuration gives (that of a run, say); gives what is changed by it."""
-        return save(self._path(), self._load(other), self._directory)
+        return save(self.path(), ParameterFile(other, self._directory).load(), self._directory)
 
-    def _load(self, given: str) -> Config:
-        folder = Path(given)
-        name = f"{folder / RUN_CONFIG}" if folder.is_dir() else given
+    def load(self) -> Config:
+        """The whole set."""
+        folder = Path(self._given)
+        name = f"{folder / RUN_CONFIG}" if folder.is_dir() else self._given
         return load_config(name, directory=self._directory, option="--config")
 
-    def _path(self) -> Path:
+    def path(self) -> Path:
+        """The file. Raises ConfigError for a name: what belongs to the program is not written."""
         if "/" in self._given or self._given.endswith((".yaml", ".yml")):
             return Path(self._given)
-        self._load(self._given)  # when there is no such name, that is what is to be said
+        self.load()  # when there is no such name, that is what is to be said
         raise ConfigError(
             [f"--config {self._given}: belongs to the program; copy its file from {self._directory}, and give the copy"]
         )
+
+
+class ParameterText:
+    """The parameters of a full configuration that somebody shows as YAML. Raises ConfigError, with all errors."""
+
+    def __init__(self, text: str, source: str, directory: Path = CONFIGS) -> None:
+        self._config = compose(Config, [parse_yaml(text, source)])
+        self._directory = directory
+
+    def find(self, names: Sequence[str]) -> tuple[Entry, ...]:
+        """Parameters, elements of them, or all of a group, by their names; without names, all."""
+        return find(self._config, names) if names else entries(self._config)
+
+    def differences(self, other: str | None) -> tuple[Change, ...]:
+        """From a configuration (name, file, or run folder) to these; without one, from the defaults."""
+        return _differences(self._config, other, self._directory)
+
+    def since(self, before: ParameterText) -> tuple[Change, ...]:
+        """From others to these."""
+        return tuple(diff(before._config, self._config))
+
+
+def _differences(mine: Config, other: str | None, directory: Path) -> tuple[Change, ...]:
+    base = (
+        Config(vehicle=load_config(directory=directory).vehicle)
+        if other is None
+        else ParameterFile(other, directory).load()
+    )
+    return tuple(diff(replace(base, scenario=mine.scenario), mine))
+
+
+def parameter_names() -> tuple[str, ...]:
+    """All parameters, as they are declared."""
+    return tuple(parameter.path for parameter in describe(Config))
+
+
+def save_in_force(given: str, loaded: Config, in_force: Config, directory: Path = CONFIGS) -> tuple[Change, ...]:
+    """Write what has been changed since the start into the file of a configuration; gives what differed.
+
+    given: name or file, as the process was started with; loaded: what file and options make now. What came from options
+    of the command line stays with them. Raises ConfigError, and has written nothing then.
+    """
+    path = ParameterFile(given, directory).path()
+    held = load_config(str(path), directory=directory)
+    changed: dict[str, Any] = {}
+    for change in diff(replace(loaded, scenario=in_force.scenario), in_force):
+        *groups, name = change.path.split(".")
+        place = changed
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[name] = _at(to_mapping(in_force), tuple(change.path.split(".")))
+    wanted = compose(Config, [Layer(str(path), to_mapping(held)), Layer("parameters in force", changed)])
+    return save(path, wanted, directory)
 
 
 def save(path: Path, wanted: Config, directory: Path = CONFIGS) -> tuple[Change, ...]:

@@ -14,7 +14,7 @@ interval, see ``onboard.scheduling``.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from queue import SimpleQueue
 from threading import Event as Flag
 from threading import Thread
@@ -38,26 +38,45 @@ def needs_restart(change: Change) -> bool:
     return change.path.partition(".")[0] not in _CHANGEABLE
 
 
+#: Told of the end: whether it was done, and the sentences on it.
+Done = Callable[[bool, Sequence[str]], None]
+
+
+class _RefusedError(Exception):
+    """The parameters stay as they are; one reason a line."""
+
+    def __init__(self, reasons: Iterable[str]) -> None:
+        self.reasons = tuple(reasons)
+        super().__init__("\n".join(self.reasons))
+
+
 class Reloader:
-    """Reloads the parameters of ``loop`` when asked to.
+    """Changes the parameters of ``loop`` when asked to, and whatever else concerns them and takes time.
 
     load: reads the files again; called in the reloader's thread.
     """
 
     def __init__(self, load: Callable[[], Params], loop: Loop) -> None:
         self._load, self._loop = load, loop
-        self._asked: SimpleQueue[bool] = SimpleQueue()
+        self._asked: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._said: deque[tuple[str, Severity, str]] = deque()
         self._thread = Thread(target=self._work, name="reload", daemon=True)
         self._thread.start()
 
-    def ask(self) -> None:
-        """Read and check the files, then swap; returns at once."""
-        self._asked.put(True)
+    def ask(self, load: Callable[[], Params] | None = None, done: Done | None = None) -> None:
+        """Put what ``load`` gives into force (without: the files, read again); returns at once.
+
+        done: told what came of it, in the reloader's thread. It is an event too, or one for each error.
+        """
+        self._asked.put(lambda: self._try(lambda: self._swap(load or self._load), "Parameters stay as they are.", done))
+
+    def ask_to(self, save: Callable[[Params], Sequence[Change]], done: Done) -> None:
+        """Call ``save`` with the parameters in force; it gives what was changed in the files, or raises ConfigError."""
+        self._asked.put(lambda: self._try(lambda: self._saved(save), "Parameters were not saved.", done))
 
     def close(self) -> None:
         """Take no more orders. What waits for a loop that no longer ticks ends with the process."""
-        self._asked.put(False)
+        self._asked.put(None)
 
     def join(self, timeout: float) -> None:
         """After ``close``, wait for what was asked before it, at most ``timeout`` seconds."""
@@ -70,25 +89,32 @@ class Reloader:
         return tuple(Event(t_ns, *self._said.popleft()) for _ in range(len(self._said)))
 
     def _work(self) -> None:
-        while self._asked.get():
-            try:
-                self._reload()
-            except ConfigError as error:
-                self._refuse(error.errors)
-            except InfeasibleError as error:
-                self._refuse([str(error)])
-            except Exception as error:  # whatever is wrong with a file must not end a flight, nor go untold
-                self._refuse([f"{type(error).__name__}: {error}"])
+        while (job := self._asked.get()) is not None:
+            job()
 
-    def _reload(self) -> None:
-        params = self._load()
+    def _try(self, job: Callable[[], Sequence[str]], failed: str, done: Done | None) -> None:
+        try:
+            told, well = job(), True
+        except ConfigError as error:
+            told, well = error.errors, False
+        except (InfeasibleError, _RefusedError) as error:
+            told, well = str(error).splitlines(), False
+        except Exception as error:  # whatever is wrong with a file must not end a flight, nor go untold
+            told, well = [f"{type(error).__name__}: {error}"], False
+        if not well:
+            for reason in told:
+                self._say("reload_refused", Severity.ERROR, f"{failed} {reason}.")
+        if done is not None:
+            done(well, told)
+
+    def _swap(self, load: Callable[[], Params]) -> Sequence[str]:
+        params = load()
         changes = diff(self._loop.params, params)
         if not changes:
             self._say("reload_unchanged", Severity.INFO, "Parameters read again: nothing differs.")
-            return
+            return ["nothing differs"]
         if fixed := [change for change in changes if needs_restart(change)]:
-            self._refuse(f"{_told(change)}: takes a restart of the process" for change in fixed)
-            return
+            raise _RefusedError(f"{_told(change)}: takes a restart of the process" for change in fixed)
         settled = Flag()
         revisions: list[int | None] = []
 
@@ -101,14 +127,16 @@ class Reloader:
         settled.wait()
         (revision,) = revisions
         if revision is None:
-            self._refuse(f"{_told(change)}: may change on the ground only" for change in grounded)
-            return
+            raise _RefusedError(f"{_told(change)}: may change on the ground only" for change in grounded)
         for change in changes:
             self._say("reloaded", Severity.INFO, f"Parameters, revision {revision}: {_told(change)}.")
+        return [f"revision {revision}", *map(_told, changes)]
 
-    def _refuse(self, reasons: Iterable[str]) -> None:
-        for reason in reasons:
-            self._say("reload_refused", Severity.ERROR, f"Parameters stay as they are. {reason}.")
+    def _saved(self, save: Callable[[Params], Sequence[Change]]) -> Sequence[str]:
+        changes = save(self._loop.params)
+        for change in changes:
+            self._say("saved", Severity.INFO, f"Parameters saved: {_told(change)}.")
+        return [*map(_told, changes)] or ["the files make these parameters already"]
 
     def _say(self, code: str, severity: Severity, text: str) -> None:
         self._said.append((code, severity, text))

@@ -119,8 +119,24 @@ class ShowPreflight(Struct, frozen=True, tag=True):
     """The checklist."""
 
 
+class ShowEvents(Struct, frozen=True, tag=True):
+    """The newest events, as JSON of ``tuple[Told, ...]``, oldest first."""
+
+
+class ListLogs(Struct, frozen=True, tag=True):
+    """The logs that the vehicle holds."""
+
+
+class ReadLog(Struct, frozen=True, tag=True):
+    """A piece of a log."""
+
+    name: Text
+    offset: Annotated[int, Meta(ge=0)]
+    size: Annotated[int, Meta(ge=1, le=256 * 1024)]
+
+
 Command = Mission | Stop | Go | Arm | Tare | SetParams | ReloadParams | SaveParams | TakeLease | ReleaseLease
-View = ShowParams | ShowPreflight
+View = ShowParams | ShowPreflight | ShowEvents | ListLogs | ReadLog
 Ask = Command | View
 
 
@@ -129,7 +145,7 @@ def way_of(ask: Ask) -> Way:
     match ask:
         case Stop() | Mission(request=Request.RETREAT | Request.KILL):
             return Way.SAFETY
-        case ShowParams() | ShowPreflight():
+        case ShowParams() | ShowPreflight() | ShowEvents() | ListLogs() | ReadLog():
             return Way.VIEW
     return Way.COMMAND
 
@@ -218,6 +234,35 @@ class Told(Struct, frozen=True):
 
     number: Stamp
     event: Event
+
+
+# --- what is shown, in the data of an answer --------------------------------------------------------------------------
+
+
+class Check(Struct, frozen=True):
+    """One line of the preflight checklist."""
+
+    name: str
+    ok: bool
+    text: str
+    """What was found."""
+    remedy: str = ""
+    """What to do about it; empty when all is well."""
+
+
+class LogFile(Struct, frozen=True):
+    """A log on the vehicle."""
+
+    name: str
+    """Relative to the folder of all runs."""
+    size: int
+    """Bytes."""
+    sha256: str
+    """Hexadecimal; empty while it is not known: it is made once the log has been finished and somebody reads it."""
+    modified_ns: int
+    """UTC."""
+    writing: bool = False
+    """It is being recorded."""
 
 
 # --- bytes ------------------------------------------------------------------------------------------------------------

@@ -10,11 +10,22 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from drivers.samples import AutopilotCommand, AutopilotState, Engage, FlightMode, Odometry, ServoCommand, ServoState
+from drivers.samples import (
+    AutopilotCommand,
+    AutopilotState,
+    Engage,
+    FlightMode,
+    JointMode,
+    Odometry,
+    ServoCommand,
+    ServoState,
+)
 from sim_backend.autopilot import SetPoint
 from sim_backend.world import World
 
 Clock = Callable[[int], int]
+
+_LIMP = ServoCommand(JointMode.OFF, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0), 0.0)
 
 
 class _Mock:
@@ -43,6 +54,7 @@ class MockAutopilot(_Mock):
     """
 
     _reached = False
+    _insisted: Engage | None = None
 
     def latest(self) -> AutopilotState | None:
         """Newest attitude, inertial data and status."""
@@ -53,6 +65,8 @@ class MockAutopilot(_Mock):
 
     def command(self, command: AutopilotCommand) -> None:
         """Hand over one fresh set-point."""
+        if self._insisted is not None and command.engage is not Engage.KILL:
+            return
         autopilot, t = self._world.autopilot, self._world.time
         if command.engage is not Engage.OFFBOARD:
             self._reached = False
@@ -74,6 +88,15 @@ class MockAutopilot(_Mock):
             elif not self._reached and autopilot.streaming(t) and autopilot.arm():
                 autopilot.switch(FlightMode.OFFBOARD, t)
 
+    def insist(self, engage: Engage | None) -> None:
+        """KILL or LAND now, and nothing else but a commanded KILL until None is given."""
+        self._insisted = engage
+        autopilot = self._world.autopilot
+        if engage is Engage.KILL:
+            autopilot.kill()
+        elif engage is Engage.LAND and autopilot.armed:
+            autopilot.switch(FlightMode.LAND, self._world.time)
+
 
 class MockOdometry(_Mock):
     """The visual-inertial tracker of the world."""
@@ -87,6 +110,8 @@ class MockOdometry(_Mock):
 class MockServos(_Mock):
     """The servo bus of the world."""
 
+    _off = False
+
     def latest(self) -> ServoState | None:
         """Newest cycle: positions, velocities, currents and health of the five servos."""
         sample = self._world.sensors.servos(self._world.snapshot)
@@ -94,4 +119,10 @@ class MockServos(_Mock):
 
     def command(self, command: ServoCommand) -> None:
         """Hand over the goals for the next cycle."""
-        self._world.command_servos(command)
+        self._world.command_servos(_LIMP if self._off else command)
+
+    def insist(self, off: bool) -> None:
+        """Torque off, and off whatever is commanded, until False is given."""
+        self._off = off
+        if off:
+            self._world.command_servos(_LIMP)

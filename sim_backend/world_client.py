@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from socket import AF_INET, SOCK_DGRAM, socket
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 
 import msgspec
 
 from drivers.mailbox import Mailbox
 from drivers.protocols import DeviceError
-from drivers.samples import AutopilotCommand, AutopilotState, Odometry, ServoCommand, ServoState
+from drivers.samples import AutopilotCommand, AutopilotState, Engage, Odometry, ServoCommand, ServoState
 from sim_backend.world_messages import HELLO, LARGEST, Bye, Camera, Command, Hello, Look, encode, from_world
 
 #: How often the camera's stream is looked at, s.
@@ -42,6 +42,10 @@ class WorldClient:
         self._mocks = mocks
         self._on_look, self._on_camera, self._streaming = on_look, on_camera, streaming
         self._phase = ""
+        self._insisted: Engage | None = None
+        self._off = False
+        self._one_hello = Lock()
+        """So that of two hellos the newer one leaves last."""
         self._looks: Mailbox[Look] = Mailbox()
         self._first = Event()
         self._socket = socket(AF_INET, SOCK_DGRAM)
@@ -83,8 +87,19 @@ class WorldClient:
         """Command the mock devices."""
         self._send(encode(command))
 
+    def insist(self, engage: Engage | None) -> None:
+        """What the mock autopilot is to do whatever is commanded; told at once, and with each hello."""
+        self._insisted = engage
+        self._hello()
+
+    def insist_off(self, off: bool) -> None:
+        """Whether the mock servos have no torque whatever is commanded; told at once, and with each hello."""
+        self._off = off
+        self._hello()
+
     def _hello(self) -> None:
-        self._send(encode(Hello(self._streaming(), self._phase, self._mocks)))
+        with self._one_hello:
+            self._send(encode(Hello(self._streaming(), self._phase, self._mocks, self._insisted, self._off)))
 
     def _send(self, packet: bytes) -> None:
         with suppress(OSError):  # as on a wire: what does not arrive is missing, and its age will tell
@@ -141,6 +156,10 @@ class LinkedAutopilot(_Linked):
         """Hand over one fresh set-point."""
         self._client.command(Command(autopilot=command))
 
+    def insist(self, engage: Engage | None) -> None:
+        """KILL or LAND now, and nothing else but a commanded KILL until None is given."""
+        self._client.insist(engage)
+
 
 class LinkedOdometry(_Linked):
     """The mock tracker of a world in another process."""
@@ -162,3 +181,7 @@ class LinkedServos(_Linked):
     def command(self, command: ServoCommand) -> None:
         """Hand over the goals for the next cycle."""
         self._client.command(Command(servos=command))
+
+    def insist(self, off: bool) -> None:
+        """Torque off, and off whatever is commanded, until False is given."""
+        self._client.insist_off(off)

@@ -87,6 +87,7 @@ class WorldServer:
                 continue  # not ours
             if isinstance(message, Hello):
                 self._peers[address] = (message, now)
+                self._insist(message)
                 if message.phase:
                     self._phase = message.phase
                     for enter in self._on_phase:
@@ -100,6 +101,14 @@ class WorldServer:
                 if message.servos is not None:
                     servos.command(message.servos)
         self._peers = {peer: entry for peer, entry in self._peers.items() if now - entry[1] < PATIENCE}
+
+    def _insist(self, hello: Hello) -> None:
+        """What the one who has the mock devices insists on."""
+        autopilot, _, servos = self._mocks
+        if "autopilot" in hello.mocks:
+            autopilot.insist(hello.insisted)
+        if "servos" in hello.mocks:
+            servos.insist(hello.off)
 
     def publish(self) -> None:
         """Tell everybody how the world looks."""

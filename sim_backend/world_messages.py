@@ -13,6 +13,7 @@ from msgspec import Struct
 from drivers.samples import (
     AutopilotCommand,
     AutopilotState,
+    Engage,
     FlightMode,
     Odometry,
     ServoCommand,
@@ -66,6 +67,10 @@ class Hello(Struct, frozen=True, tag=True, gc=False):
     """Of the mission; empty: nobody flies."""
     mocks: tuple[str, ...] = ()
     """Devices whose samples are wanted: autopilot, odometry, servos."""
+    insisted: Engage | None = None
+    """What the mock autopilot is to do whatever is commanded."""
+    off: bool = False
+    """The mock servos have no torque whatever is commanded."""
 
 
 class Bye(Struct, frozen=True, tag=True, gc=False):

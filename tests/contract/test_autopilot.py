@@ -11,6 +11,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from math import hypot
 from pathlib import Path
+from threading import Thread
 
 import msgspec
 import pytest
@@ -27,6 +28,7 @@ from sim_backend.mock_devices import MockAutopilot
 from sim_backend.px4_emulator import Px4StandIn
 from sim_backend.world import World
 from tests.contract.hardware import REAL, named, stays_put
+from tests.waiting import LONG, seconds_until
 
 pytestmark = pytest.mark.asyncio
 moves = pytest.mark.moves
@@ -331,3 +333,61 @@ async def test_kill_cuts_the_motors_at_once(rig: Rig) -> None:
     assert rig.world.time - t < 0.3
     await rig.run(lambda: not rig.state().armed, lambda: command(Engage.KILL), within=2.0)
     await rig.run(lambda: sum(rig.world.truth().rotor_thrust) < 0.1, within=2.0)
+
+
+def from_elsewhere(rig: Rig, engage: Engage | None) -> None:
+    """Insist in a thread of its own, while the event loop stands still."""
+    thread = Thread(target=rig.device.insist, args=(engage,))
+    thread.start()
+    thread.join(LONG)
+    assert not thread.is_alive()
+
+
+@moves
+async def test_insisting_on_a_kill_needs_no_event_loop(rig: Rig) -> None:
+    await rig.engage()
+    from_elsewhere(rig, Engage.KILL)
+    seconds_until(lambda: not rig.world.autopilot.armed)
+
+
+@moves
+async def test_what_is_insisted_on_outranks_what_is_commanded(rig: Rig) -> None:
+    await rig.engage()
+    from_elsewhere(rig, Engage.KILL)
+    await rig.run(lambda: not rig.state().armed, lambda: command(Engage.OFFBOARD))
+    await rig.run(lambda: rig.world.truth().on_ground)
+    before = rig.set_points()
+    await rig.ticks(300, Engage.OFFBOARD)
+    assert not rig.state().armed
+    assert rig.set_points() == before
+
+
+@moves
+async def test_flies_again_once_nobody_insists_any_more(rig: Rig) -> None:
+    await rig.engage()
+    rig.device.insist(Engage.KILL)
+    await rig.run(lambda: not rig.state().armed, lambda: command(Engage.OFFBOARD))
+    rig.device.insist(None)
+    await rig.ticks(10, Engage.IDLE)
+    await rig.take_off()
+
+
+@moves
+async def test_insisting_on_a_landing_lands_and_offboard_is_not_taken_back(rig: Rig) -> None:
+    await rig.take_off()
+    from_elsewhere(rig, Engage.LAND)
+    await rig.run(lambda: rig.state().mode is FlightMode.LAND, rig.hover, within=2.0)
+    before = rig.set_points()
+    await rig.ticks(25, Engage.OFFBOARD)
+    assert rig.set_points() == before
+    rig.device.insist(None)
+    await rig.run(lambda: not rig.state().armed and rig.state().landed is Landed.ON_GROUND, rig.hover)
+    assert not rig.world.truth().crashed
+
+
+@moves
+async def test_a_commanded_kill_outranks_an_insisted_landing(rig: Rig) -> None:
+    await rig.take_off()
+    rig.device.insist(Engage.LAND)
+    await rig.run(lambda: not rig.world.autopilot.armed, lambda: command(Engage.KILL), within=2.0)
+    assert not rig.world.truth().on_ground

@@ -11,6 +11,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
+from threading import Thread
 
 import msgspec
 import pytest
@@ -262,3 +263,30 @@ async def test_what_is_not_finite_changes_nothing(rig: Rig) -> None:
         rig.device.command(broken)
         await rig.tick()
     assert rig.true() == pytest.approx(before, abs=rig.close)
+
+
+@moves
+async def test_insisting_takes_the_torque_whatever_is_commanded(rig: Rig) -> None:
+    await rig.until(lambda: rig.device.latest() is not None)
+    await rig.until(lambda: rig.state().torque_on, rig.hold())
+    thread = Thread(target=rig.device.insist, args=(True,))
+    thread.start()
+    thread.join()
+    await rig.until(lambda: not rig.state().torque_on, rig.hold())
+    go, began = rig.hold(0.1, 0.1, -0.2, 0.8, 0.5), rig.ticks
+    while rig.ticks < began + 100:
+        rig.device.command(go())
+        await rig.tick()
+        assert not rig.state().torque_on
+    rig.device.insist(False)
+    await rig.until(lambda: rig.state().torque_on, rig.hold())
+
+
+@moves
+async def test_insisting_needs_no_command(rig: Rig) -> None:
+    """As when the loop hangs."""
+    await rig.until(lambda: rig.device.latest() is not None)
+    await rig.until(lambda: rig.state().torque_on, rig.hold())
+    rig.device.insist(True)
+    await rig.until(lambda: not rig.state().torque_on)
+    rig.device.insist(False)

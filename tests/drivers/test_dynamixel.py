@@ -45,6 +45,7 @@ from sim_backend.dynamixel_emulator import DynamixelEmulator, emulate
 from sim_backend.dynamixel_mechanics import FreeServos
 from sim_backend.dynamixel_servo import Servo
 from sim_backend.dynamixel_troubles import KINDS
+from sim_backend.dynamixel_wire import Instruction, Packet
 from sim_backend.faults import Kind
 
 pytestmark = pytest.mark.asyncio
@@ -579,6 +580,47 @@ async def test_the_adapter_unplugged_and_put_back(rig: Rig) -> None:
     assert sum("is back" in text and "adapter" in text for text in rig.texts()) == 1
     assert rig.driver.statistics().errors["adapter lost"] == 1
     await rig.until(lambda: rig.state().position == pytest.approx(GOALS, abs=0.01), command)
+
+
+async def test_insisting_is_the_next_packet_each_time(rig: Rig) -> None:
+    """And then the readings go on."""
+    await rig.engaged()
+    seen: list[bytes] = []
+    handle = rig.emulator.bus.handle
+
+    def noted(packet: Packet, now: float, speed: int | None = None) -> tuple[bytes, float]:
+        if packet.instruction == Instruction.SYNC_WRITE:
+            seen.append(packet.parameters)
+        return handle(packet, now, speed)
+
+    rig.emulator.bus.handle = noted  # type: ignore[method-assign]
+    off = xc330.TORQUE_ENABLE.address.to_bytes(2, "little") + b"\1\0" + b"".join(bytes((m.id, 0)) for m in MOUNTING)
+    for count in (1, 2, 3):
+        rig.driver.insist(True)
+        await rig.until(lambda count=count: seen.count(off) == count)  # type: ignore[misc]
+    await rig.fresh(10, command)
+    assert not any(servo.torque_on for servo in rig.emulator.bus.servos)
+    assert not rig.state().torque_on
+    assert seen.count(off) <= 4  # a reading may have been on its way when the first one went out
+
+
+async def test_torque_stays_off_behind_a_new_adapter(rig: Rig) -> None:
+    await rig.engaged()
+    await asyncio.to_thread(rig.emulator.unplug)
+    await rig.until(lambda: rig.heard("adapter on"), command)
+    rig.driver.insist(True)
+    await asyncio.to_thread(rig.emulator.plug)
+    await rig.until(lambda: not any(servo.torque_on for servo in rig.emulator.bus.servos), command)
+    last = rig.state().t_ns
+    await rig.until(lambda: rig.state().t_ns > last, command)
+    assert not rig.state().torque_on
+    rig.driver.insist(False)
+    await rig.until(lambda: rig.state().torque_on, command)
+
+
+async def test_insisting_outside_of_start_and_stop(rig: Rig) -> None:
+    with pytest.raises(DeviceError, match=r"insist\(\) before start\(\) or after stop\(\)"):
+        Dynamixel(rig.settings).insist(True)
 
 
 async def test_hardware_errors_are_told_in_words_and_the_readings_go_on(rig: Rig) -> None:

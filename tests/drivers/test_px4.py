@@ -7,6 +7,7 @@ import time
 from collections.abc import AsyncIterator
 from math import cos, inf, isnan, nan, pi, sin
 from socket import AF_INET, SOCK_DGRAM, socket
+from typing import Any
 
 import msgspec
 import pytest
@@ -314,6 +315,36 @@ async def test_offboard_is_not_taken_back_from_a_pilot(pair: tuple[Px4, Px4Stand
     px4.command(command(Engage.LAND))
     await until(lambda: not state()[0])
     await until(lambda: state() == (True, FlightMode.OFFBOARD), tick)
+
+
+async def test_each_insistence_is_one_numbered_message(pair: tuple[Px4, Px4StandIn]) -> None:
+    px4, stand_in = pair
+    seen: list[tuple[int, float, int]] = []
+    handle = stand_in._handlers["COMMAND_LONG"]
+
+    def on_command(m: Any) -> None:
+        if m.command in (400, 176):
+            seen.append((m.command, m.param2, m.confirmation))
+        handle(m)
+
+    stand_in._handlers["COMMAND_LONG"] = on_command
+    kill, land = (400, 21196.0), (176, 4.0)
+    calls = (Engage.KILL, Engage.KILL, Engage.LAND, Engage.LAND, Engage.LAND, Engage.KILL, None, Engage.KILL)
+    for engage in calls:
+        px4.insist(engage)
+    await until(lambda: len(seen) == 7)
+    assert seen == [(*kill, 0), (*kill, 1), (*land, 0), (*land, 1), (*land, 2), (*kill, 0), (*kill, 0)]
+
+
+@pytest.mark.parametrize("engage", [Engage.IDLE, Engage.OFFBOARD])
+async def test_only_what_is_safe_can_be_insisted_on(pair: tuple[Px4, Px4StandIn], engage: Engage) -> None:
+    with pytest.raises(ValueError, match=rf"insist\({engage}\); want kill, land or None"):
+        pair[0].insist(engage)
+
+
+async def test_insisting_outside_of_start_and_stop() -> None:
+    with pytest.raises(DeviceError, match=r"insist\(\) before start\(\) or after stop\(\)"):
+        Px4(settings("udpin://127.0.0.1:0")).insist(Engage.KILL)
 
 
 async def test_a_refusal_is_told_with_px4s_reason(pair: tuple[Px4, Px4StandIn]) -> None:

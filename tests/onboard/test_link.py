@@ -213,21 +213,23 @@ def test_events_that_do_not_fit_are_counted_at_both_ends_and_hold_nobody_up(
     assert alice.wait(lambda contact: contact.pulse is not None and contact.pulse.dropped == 1000 - 256, LONG)
 
 
-def test_stop_is_answered_while_telemetry_and_events_are_stuck(vehicle: Vehicle, join: Callable[..., Client]) -> None:
+def test_stop_is_answered_while_telemetry_and_events_are_stuck(
+    vehicle: Vehicle, join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
     alice = join("alice")
-    gate, stuck, put = threading.Event(), threading.Event(), vehicle.link._publish
+    gate, stuck = threading.Event(), threading.Event()
 
     def block(*arguments: object) -> None:
         stuck.set()
         gate.wait(LONG)
 
-    vehicle.link._publish = block  # type: ignore[assignment]
+    monkeypatch.setattr(vehicle.link, "_publish", block)
     try:
         vehicle.link.event(event("stuck"))
         assert stuck.wait(LONG)
         assert alice.ask(Stop(), timeout=LONG).outcome is Outcome.DONE
     finally:
-        vehicle.link._publish = put
+        monkeypatch.undo()
         gate.set()
 
 
@@ -600,11 +602,26 @@ def test_names_that_cannot_be(vehicle: Vehicle, wrong: dict[str, str]) -> None:
         Client(replace(settings(vehicle, "alice"), **wrong))
 
 
-def test_a_vehicle_of_another_version_is_told(vehicle: Vehicle) -> None:
-    vehicle.link._publish = (
-        lambda key, message, how: vehicle.link._session.put(  # type: ignore[assignment, union-attr]
-            key, b"PW\x02" + encode(message)[3:]
-        )
+def test_opened_anew_all_come_again_and_who_commands_goes_on(vehicle: Vehicle, join: Callable[..., Client]) -> None:
+    alice = join("alice")
+    assert alice.ask(TakeLease()).outcome is Outcome.DONE
+    vehicle.link.reopen(None)
+    assert vehicle.link.state().commander == "alice"
+    seconds_until(lambda: vehicle.link.state().present)
+
+    def heard() -> bool:
+        vehicle.link.event(event("anew"))
+        return any(told.event.text == "anew" for told in alice.events)
+
+    seconds_until(heard)
+    assert alice.ask(Mission(Request.HOLD), timeout=LONG).outcome is not Outcome.REFUSED
+
+
+def test_a_vehicle_of_another_version_is_told(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = vehicle.link._session
+    assert session is not None
+    monkeypatch.setattr(
+        vehicle.link, "_publish", lambda key, message, how: session.put(key, b"PW\x02" + encode(message)[3:])
     )
     with pytest.raises(NoVehicleError, match=r"x500 at .* is not understood: message of version 2"):
         Client(settings(vehicle, "alice"), timeout=1.0)
