@@ -22,7 +22,7 @@ from msgspec import Struct
 from drivers.mailbox import Level, Notice, Notices, Teller
 from onboard import lease as leases
 from onboard.core.mission import GROUND
-from onboard.core.types import Event, Tick
+from onboard.core.types import Event, LinkState, Tick
 from onboard.endpoints import ZenohConfig, open_session
 from onboard.lease import Lease, Watch
 from onboard.link_settings import LinkSettings
@@ -54,21 +54,6 @@ from onboard.wire import (
 _RATES: Final = {Way.SAFETY: 100.0, Way.COMMAND: 50.0, Way.VIEW: 20.0, "pulse": 100.0}
 _EVENTS, _ANSWERS = 256, 256
 _CLOSING = 0.5
-
-
-class LinkState(Struct, frozen=True, gc=False):
-    """What the core needs to know of the link: facts, on the clock of the ticks."""
-
-    commander: str = ""
-    """Name of the station that commands; empty: nobody does."""
-    heard_ns: int = 0
-    """What was last heard of it was certainly sent after this time."""
-    present: bool = False
-    """It is connected. It is not once it has closed or died, or was frozen or out of reach for the peer lease."""
-
-    def age(self, t_ns: int) -> float:
-        """Time since the commander was certainly there, s; 0 when nobody commands."""
-        return max(0, t_ns - self.heard_ns) * 1e-9 if self.commander else 0.0
 
 
 class Asked(Struct, frozen=True):

@@ -48,6 +48,14 @@ class Request(StrEnum):
     KILL = "kill"
     RESET = "reset"
     """Back to preflight, on the ground only."""
+    STOP = "stop"
+    """Whatever it does: hold; asked again, land."""
+    ARM = "arm"
+    """Arm and idle on the ground."""
+    TARE = "tare"
+    """Take what the force sensor feels away from contact for nothing, by hand."""
+    GO = "go"
+    """To the phase ``Inputs.go`` names."""
 
 
 class Action(IntEnum):
@@ -59,6 +67,21 @@ class Action(IntEnum):
     RETREAT = 3
     LAND = 4
     KILL = 5
+
+
+class LinkState(Struct, frozen=True, gc=False):
+    """What is known of the link: facts, on the clock of the ticks."""
+
+    commander: str = ""
+    """Name of the station that commands; empty: nobody does."""
+    heard_ns: int = 0
+    """What was last heard of it was certainly sent after this time."""
+    present: bool = False
+    """It is connected. It is not once it has closed or died, or was frozen or out of reach for the peer lease."""
+
+    def age(self, t_ns: int) -> float:
+        """Time since the commander was certainly there, s; 0 when nobody commands."""
+        return max(0, t_ns - self.heard_ns) * 1e-9 if self.commander else 0.0
 
 
 class Inputs(Struct, frozen=True, gc=False):
@@ -74,6 +97,10 @@ class Inputs(Struct, frozen=True, gc=False):
     request: Request | None = None
     obstacles: tuple[str, ...] = ()
     """Sentences on why the vehicle must not arm, from outside the core."""
+    go: Phase | None = None
+    """Where ``Request.GO`` is to lead; with any other request, nothing."""
+    link: LinkState = LinkState()
+    """The station that commands."""
 
 
 class Estimate(Struct, frozen=True, gc=False):
