@@ -18,7 +18,8 @@ Each tick, `onboard/core/safety.py` looks at facts. A condition becomes active w
 each active condition demands an action by phase group, and the most severe demand wins. The event of a condition is a
 sentence that says what is the matter and what to do. The values below are the defaults of its parameters.
 
-- **Ground**: PREFLIGHT and STOPPED. **Contact**: phases in which contact is expected. **Free**: all others.
+- **Ground**: PREFLIGHT and STOPPED. **Contact**: phases in which contact is expected. **Free**: all others, ARMED
+  included: it stands on the ground, and whatever demands HOLD or more disarms it.
 - HOLD hovers in place. RETREAT backs off along the pipe's normal, then hovers. LAND lands. KILL cuts the motors.
 - In contact the mission leads HOLD through RETREAT_HOLD and LAND through RETREAT_LAND: the force is taken back first.
 - *Blind* conditions mean that position or attitude is lost, and with it position control: LAND is then flown by the
@@ -26,6 +27,10 @@ sentence that says what is the matter and what to do. The values below are the d
 - When the autopilot leaves offboard by itself, it or a pilot has command: the core asks nothing of it but KILL.
 - A condition clears once all has been well for {{clear}} s; a latched one only in PREFLIGHT, after a reset. Nothing
   resumes by itself: the mission stays where the action has led it.
+- The link: nobody is lost while nobody commands. A commanding station that falls silent holds the vehicle, in contact
+  after a retreat, and lands it when it stays silent; a takeoff on the ground is broken off, a landing goes on. On the
+  ground it is a warning, and as every warning of preflight it keeps the vehicle from taking off until the station has
+  been heard again for a while. Heard again in flight is told, and that is all: the mission stays on hold, or lands.
 - A value that is not finite violates every bound it is compared with, and `non_finite` at once; it alone never cuts
   the motors.
 
@@ -41,6 +46,10 @@ The transition table of `onboard/core/mission.py`. Rows are tried in order, the 
 before an action of the same or lower rank, and both before facts. Refused requests are left out; the sentence of each
 refusal is in the code.
 
+The request to stop has no rows, for it stands for another: to hold in free flight; in contact, to retreat; once the
+vehicle holds, or retreats to hold, to land. A retreat that would go on to RETURN is held first. It remembers nothing:
+whoever asked for the first stop, the second lands.
+
 | From | On | If | To | Event |
 |---|---|---|---|---|
 {{rows}}
@@ -51,6 +60,9 @@ Every phase but STOPPED has a time limit:
 |---|---|---|
 {{limits}}
 """
+
+
+_TO = {mission.INTERRUPTED: "the interrupted phase", mission.NAMED: "the phase that was named"}
 
 
 def safety_page() -> str:
@@ -80,7 +92,7 @@ def mission_page() -> str:
         causes = ", ".join(_cause(cause) for cause in row.causes)
         condition = (row.condition.__doc__ or "").rstrip(".")
         phases = ", ".join(phase.name for phase in row.phases)
-        to = "the interrupted phase" if row.to == mission.INTERRUPTED else row.to.name
+        to = _TO.get(row.to, row.to.upper())
         rows.append(f"| {phases} | {causes} | {condition} | {to} | `{row.code}`: {mission.SENTENCES[row.code][1]} |")
     limits = []
     for field, hint in get_type_hints(mission.Params, include_extras=True).items():

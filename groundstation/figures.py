@@ -20,6 +20,7 @@ _STRETCH = 0.5
 #: Kind of a phase, which chooses its colour.
 _KINDS = {
     Phase.PREFLIGHT: "ground",
+    Phase.ARMED: "ground",
     Phase.STOPPED: "ground",
     Phase.ADHESIVE: "adhesive",
     Phase.ADVANCE: "contact",

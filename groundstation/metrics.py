@@ -38,7 +38,7 @@ STATES = tuple(PAPER["state_rmse"])
 #: A gap in the contact longer than this is a loss of contact, s.
 BOUNCE_GAP = 0.010
 _LANDING = (Phase.LAND, Phase.RETREAT_LAND)
-_GROUNDED = (Phase.PREFLIGHT, Phase.STOPPED)
+_GROUNDED = (Phase.PREFLIGHT, Phase.ARMED, Phase.STOPPED)
 _HOLDING = (Phase.HOLD, Phase.RETREAT_HOLD)
 _IN_CONTACT = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE)
 

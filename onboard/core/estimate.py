@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from onboard.core.params import Params as AllParams
 
 NEAR_PIPE = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE)
-ON_GROUND = (Phase.PREFLIGHT, Phase.STOPPED)
+ON_GROUND = (Phase.PREFLIGHT, Phase.ARMED, Phase.STOPPED)
 
 
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
@@ -144,6 +144,8 @@ def step(
         watched = observer.accumulate(watched, R)
         if progress.tared:
             watched = observer.finish_tare(watched)
+    elif watched.count and not progress.tare_begun:
+        watched = observer.drop_tare(watched)
     force = observer.external_force(watched, R, params.observer)
     n = site.normal
     compression = -(force[0] * n[0] + force[1] * n[1])

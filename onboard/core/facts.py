@@ -63,6 +63,8 @@ def for_safety(
             dt=inputs.dt,
             inputs_finite=seen.finite,
             obstacles=" ".join(inputs.obstacles),
+            commander=inputs.link.commander,
+            link_age=inputs.link.age(inputs.t_ns),
             missing=", ".join(
                 name for name, told in zip(_DEVICES, (odometry, autopilot, servos), strict=True) if told is None
             ),
@@ -100,14 +102,16 @@ def for_safety(
         engaged_before and autopilot.mode is not FlightMode.OFFBOARD,
         seen.disagreement,
         obstacles=" ".join(inputs.obstacles),
+        commander=inputs.link.commander,
+        link_age=inputs.link.age(inputs.t_ns),
     )
 
 
 def for_mission(
     seen: estimating.State, believed: Estimate, progress: Progress, phase: Phase, flying: bool, verdict: Verdict,
-    derived: Derived, params: Params,
+    go: Phase | None, derived: Derived, params: Params,
 ) -> mission.Facts:  # fmt: skip
-    """Facts of one tick. progress: of the reference in the tick before, in the same phase."""
+    """Facts of one tick. progress: of the reference in the tick before, in the same phase. go: where to, if asked."""
     told = seen.autopilot
     armed = told is not None and told.armed
     grounded = told is not None and told.landed is Landed.ON_GROUND
@@ -131,6 +135,10 @@ def for_mission(
         overtravel=phase is Phase.ADVANCE and beyond > params.plan.overtravel,
         blind=safety.blind(verdict),
         offboard_lost=safety.yielded(verdict),
+        payload=believed.payload,
+        tare=seen.observer.tare,
+        tare_used=params.observer.tare,
+        go=go,
     )
 
 

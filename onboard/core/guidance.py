@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 from msgspec import Struct
 from msgspec.structs import replace
 
+from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from onboard.core import admittance, force_profile, fuzzy, kinematics, plan
 from onboard.core.math3 import wrap_angle
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from onboard.core.params import Params as AllParams
 
 ZERO: Eight = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-STANDING = (Phase.PREFLIGHT, Phase.STOPPED)
+STANDING = (Phase.PREFLIGHT, Phase.ARMED, Phase.STOPPED)
 PRESSING = (Phase.PRESS, Phase.RELEASE)
 #: The tool moves close to the pipe: the arm makes up for where the base is.
 AT_THE_PIPE = (Phase.ADHESIVE, Phase.TOOL_CHANGE)
@@ -90,7 +91,7 @@ class State(Struct, frozen=True, gc=False):
     settled: float
     """Time within the tolerances since the last leg ended, s."""
     clock: float
-    """Time since the last leg of the phase ended, s."""
+    """Time since the last leg of the phase ended, or since a tare was begun after it, s."""
     lift: float
     press_time: float
     """Time since the trigger, s."""
@@ -102,6 +103,8 @@ class State(Struct, frozen=True, gc=False):
     admittance: admittance.State
     released_for: float
     """Time since the gripper was seen open, s."""
+    tare: bool = False
+    """Hovering, a tare was asked for."""
 
 
 class Progress(Struct, frozen=True, gc=False):
@@ -110,6 +113,8 @@ class Progress(Struct, frozen=True, gc=False):
     arrived: bool = False
     pressed: bool = False
     released: bool = False
+    tare_begun: bool = False
+    """The readings from now on are to become one tare: those that are made while ``taring``."""
     taring: bool = False
     tared: bool = False
     grounded: bool = False
@@ -143,6 +148,7 @@ def step(
     state: State,
     estimate: Estimate,
     phase: Phase,
+    tare: bool,
     engaged: bool,
     pump: float,
     derived: Derived,
@@ -151,7 +157,8 @@ def step(
 ) -> tuple[State, Reference, Progress]:
     """One tick of the reference.
 
-    engaged: the autopilot follows our set-points; pump: measured angle of the pump servo, rad.
+    tare: hovering, a tare was asked for; engaged: the autopilot follows our set-points; pump: measured angle of the
+    pump servo, rad.
     """
     own, site = params.guidance, derived.site
     if not estimate.valid:
@@ -164,6 +171,8 @@ def step(
         return state, _reference(state, params, 0.0, 0.0, False), Progress()
 
     lift, easing, clock, settled = state.lift, state.easing, state.clock, state.settled
+    if tare and not state.tare:
+        clock = 0.0
     if phase is Phase.TAKEOFF:
         if engaged and lift < 1.0:
             lift = min(1.0, lift + dt / params.plan.spool)
@@ -221,14 +230,16 @@ def step(
         phase, state.legs, state.index, state.time, state.start, state.start_rate, state.start_acceleration,
         state.moving,
         state.at, state.rate, state.acceleration, state.home, settled, clock, lift, press_time, state.press_start,
-        force, easing, compliant, released_for,
+        force, easing, compliant, released_for, tare,
     )  # fmt: skip
     arrived = ended and easing < 0.0 and settled >= own.settle_time and lift >= 1.0
-    taring = phase is Phase.TARE and arrived and clock >= own.tare_settle
+    tare_begun = tare or phase is Phase.TARE
+    taring = tare_begun and arrived and clock >= own.tare_settle
     progress = Progress(
         arrived,
         pressed,
         released_for >= own.release_hold,
+        tare_begun,
         taring,
         taring and clock >= own.tare_settle + own.tare_time,
         phase is Phase.LAND and lift <= 0.0,
@@ -338,19 +349,25 @@ def _plan(phase: Phase, state: State, site: Site, params: AllParams) -> tuple[Le
     p, at = params.plan, state.at
     path = Path(at, p)
     n = site.normal
+    ready = (p.needle_reach - READY_BACK, 0.0, -0.5 * pi)
     if phase is Phase.TAKEOFF:
         path.to(base=(at[0], at[1], state.home[2] + p.takeoff_height))
     elif phase is Phase.APPROACH:
-        ready = (p.needle_reach - READY_BACK, 0.0, -0.5 * pi)
         for point in plan.route(at, plan.beside(site, site.far), params.pipe, site, p):
             path.to(base=point, arm=ready)
     elif phase is Phase.ALIGN:
+        _arm_first(path, ready, plan.beside(site, site.needle))
         path.to(yaw=site.yaw).to(base=plan.beside(site, site.needle), slow=True)
     elif phase is Phase.ADHESIVE:
+        if at[:3] != plan.beside(site, site.needle):
+            _arm_first(path, ready, plan.beside(site, site.needle))
+            path.to(yaw=site.yaw).to(base=plan.beside(site, site.needle), slow=True)
         _adhesive(path, site, params)
     elif phase is Phase.TOOL_CHANGE:
+        _arm_first(path, ready, plan.beside(site, site.near))
         path.to(base=plan.beside(site, site.near), slow=True).to(arm=(p.press_reach, 0.0, 0.0))
     elif phase is Phase.TARE:
+        _arm_first(path, (p.press_reach, 0.0, 0.0), plan.beside(site, site.near))
         path.to(base=plan.beside(site, site.near), yaw=site.yaw, arm=(p.press_reach, 0.0, 0.0), slow=True)
     elif phase is Phase.ADVANCE:
         way = p.gap + p.overtravel + BEYOND
@@ -371,6 +388,12 @@ def _plan(phase: Phase, state: State, site: Site, params: AllParams) -> tuple[Le
         target = tuple(a + 0.5 * time * v for a, v in zip(at, state.rate, strict=True))
         path.add(Leg(target, time))  # type: ignore[arg-type]
     return path.legs
+
+
+def _arm_first(path: Path, arm: tuple[float, float, float], base: Vec3) -> None:
+    """Away from ``base``, beside the pipe, bring the arm into the pose in which it may come there."""
+    if path.at[:3] != base and path.at[4:7] != arm:
+        path.to(arm=arm)
 
 
 def _adhesive(path: Path, site: Site, params: AllParams) -> None:

@@ -100,6 +100,11 @@ def finish_tare(state: State) -> State:
     return State(state.force, state.thrust, (t[0] / n, t[1] / n, t[2] / n), (0.0, 0.0, 0.0), 0)
 
 
+def drop_tare(state: State) -> State:
+    """Forget the accumulated readings of a tare that was broken off; the one before stays in force."""
+    return State(state.force, state.thrust, state.tare, (0.0, 0.0, 0.0), 0)
+
+
 def external_force(state: State, R_WB: Mat3, params: Params) -> Vec3:
     """Estimated external force on the vehicle, tared when asked for, N, W."""
     if not params.tare:

@@ -90,6 +90,9 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     joint_error: Annotated[float, spec("rad", 0.02, 3.2, "of the worst arm joint against its reference")] = 0.5
     joint_error_time: Annotated[float, spec("s", 0.0, 10.0, "of joint error")] = 1.0
 
+    link_silent: Annotated[float, spec("s", 0.3, 60.0, "since the commanding station was heard: hold")] = 2.0
+    link_lost: Annotated[float, spec("s", 0.5, 600.0, "since the commanding station was heard: land")] = 10.0
+
     battery_low: Annotated[float, spec("1", 0.0, 1.0, "remaining charge")] = 0.25
     battery_low_voltage: Annotated[float, spec("V", 0.0, 60.0, "battery voltage")] = 14.0
     battery_critical: Annotated[float, spec("1", 0.0, 1.0, "remaining charge")] = 0.12
@@ -156,6 +159,10 @@ class Facts(Struct, frozen=True, gc=False):
     """Names of the devices that have not told anything yet; their ages count as 0."""
     obstacles: str = ""
     """Sentences on why the vehicle must not arm, from outside the core."""
+    commander: str = ""
+    """Name of the station that commands; empty: nobody does."""
+    link_age: float = 0.0
+    """Time since the commander was certainly there, s; 0 when nobody commands."""
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
@@ -217,7 +224,7 @@ def _finite(f: Facts) -> bool:
     total = (
         f.odometry_jump + f.confidence + f.tilt + x + y + z + f.contact_force + f.free_flight_force + f.temperature
         + f.servo_voltage_min + f.servo_voltage_max + f.joint_error + f.battery_voltage + f.battery_remaining + f.dt
-        + f.disagreement
+        + f.disagreement + f.link_age
     )  # fmt: skip
     return f.inputs_finite and total - total == 0.0
 
@@ -293,6 +300,9 @@ TABLE: Final[tuple[Condition, ...]] = (
               lambda f, p: not f.pressing or f.contact_force >= p.contact_force,
               "contact_time", WARNS, WELL),
     Condition("contact_stray", _no_stray_force, "free_force_time", BACKS_OFF, WELL),
+
+    Condition("link_silent", lambda f, p: f.link_age <= p.link_silent, None, HOLDS, WELL),
+    Condition("link_lost", lambda f, p: f.link_age <= p.link_lost, None, LANDS, WELL),
 
     Condition("battery_low",
               lambda f, p: f.battery_remaining >= p.battery_low and f.battery_voltage >= p.battery_low_voltage,
@@ -424,6 +434,15 @@ WORDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType({
     "contact_stray": (
         "external force above {p.free_force:g} N in flight where no contact should be",
         "External force of {f.free_flight_force:.1f} N where none should be: an obstacle, wind, or the payload.",
+    ),
+
+    "link_silent": (
+        "the commanding station silent for more than {p.link_silent:g} s",
+        "{f.commander} commands, and is silent for {f.link_age:.1f} s. Bring it back into reach, or seize command.",
+    ),
+    "link_lost": (
+        "the commanding station silent for more than {p.link_lost:g} s",
+        "{f.commander} commands, and is lost: silent for {f.link_age:.1f} s. Seize command from another station.",
     ),
 
     "battery_low": (

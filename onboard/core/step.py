@@ -52,10 +52,10 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
         seen, believed, inputs, before, flying, state.engaged, state.reference, state.control.compensation
     )
     safe, verdict, alarms = safety.step(state.safety, dangers, params.safety, dt)
-    known = facts.for_mission(seen, believed, state.progress, before, flying, verdict, derived, params)
+    known = facts.for_mission(seen, believed, state.progress, before, flying, verdict, inputs.go, derived, params)
     task, said = mission.step(state.mission, inputs.request, verdict.action, known, params.mission, dt)
     guided, reference, progress = guidance.step(
-        state.guidance, believed, task.phase, known.engaged, _pump(seen), derived, params, dt
+        state.guidance, believed, task.phase, task.taring, known.engaged, _pump(seen), derived, params, dt
     )
     aloft = flying and reference.lift >= 1.0
     at_pipe = task.phase in estimate.NEAR_PIPE

@@ -16,6 +16,8 @@ class Phase(StrEnum):
     """Phases of the repair mission, and the safe states beside it."""
 
     PREFLIGHT = "preflight"
+    ARMED = "armed"
+    """On the ground, the motors idle."""
     TAKEOFF = "takeoff"
     APPROACH = "approach"
     ALIGN = "align"
@@ -49,13 +51,13 @@ class Request(StrEnum):
     RESET = "reset"
     """Back to preflight, on the ground only."""
     STOP = "stop"
-    """Whatever it does: hold; asked again, land."""
+    """Whatever it does: hold, in contact retreat; on hold, land."""
     ARM = "arm"
-    """Arm and idle on the ground."""
+    """Arm, and idle on the ground."""
     TARE = "tare"
-    """Take what the force sensor feels away from contact for nothing, by hand."""
+    """Hovering: take what the observer reads away from contact for no force."""
     GO = "go"
-    """To the phase ``Inputs.go`` names."""
+    """On hold: go to the phase that ``Inputs.go`` names."""
 
 
 class Action(IntEnum):

@@ -53,10 +53,10 @@ class Follower:
         twin.__dict__ = self.__dict__ | {"steps": self.steps[-1:]}
         return twin
 
-    def tick(self, phase: Phase, engaged: bool = True) -> Step:
+    def tick(self, phase: Phase, engaged: bool = True, tare: bool = False) -> Step:
         """One tick in ``phase``."""
         self.state, reference, progress = guidance.step(
-            self.state, self.estimate, phase, engaged, 0.0, derive(self.config), self.config, DT
+            self.state, self.estimate, phase, tare, engaged, 0.0, derive(self.config), self.config, DT
         )
         self.steps.append(Step(phase, reference, progress))
         theta_1, theta_2, _ = kinematics.nearest_wrist(self.config.vehicle.arm, *reference.wrist)

@@ -188,7 +188,7 @@ def known(
     seen: estimating.State = SEEN, believed: Estimate = HIGH, phase: Phase = Phase.APPROACH,
     progress: Progress = Progress(), flying: bool = True, verdict: Verdict = WELL,  # noqa: B008 - frozen
 ) -> mission.Facts:  # fmt: skip
-    return facts.for_mission(seen, believed, progress, phase, flying, verdict, DERIVED, CONFIG)
+    return facts.for_mission(seen, believed, progress, phase, flying, verdict, Phase.ALIGN, DERIVED, CONFIG)
 
 
 READY = replace(SEEN, autopilot=autopilot(armed=False, landed=Landed.ON_GROUND, mode=FlightMode.HOLD))
@@ -246,7 +246,7 @@ def test_overtravel_is_how_far_the_tip_is_past_the_crack_in_the_advance(heading:
         tip = (site.crack[0] + way * site.normal[0], site.crack[1] + way * site.normal[1], site.crack[2])
         for phase in (Phase.ADVANCE, Phase.PRESS):
             seen = facts.for_mission(
-                SEEN, replace(HIGH, tip_W=tip), Progress(), phase, True, WELL, derive(config), config
+                SEEN, replace(HIGH, tip_W=tip), Progress(), phase, True, WELL, None, derive(config), config
             )
             assert seen.overtravel is (told and phase is Phase.ADVANCE)
 
