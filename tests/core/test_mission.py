@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from itertools import islice, product
 from math import inf, nan
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -686,7 +687,9 @@ def test_every_row_of_the_table_can_fire() -> None:
 
 def endings(phase: Phase) -> Iterator[tuple[State, Facts]]:
     """What facts alone may depend on: one at a time, with the flags of the state."""
-    ends = [{"arrived": True}, {"arrived": True, "tared": True}, {"landed": True, "disarmed": True}, {}]
+    ends: list[dict[str, Any]] = [
+        {"arrived": True}, {"arrived": True, "tared": True}, {"landed": True, "disarmed": True}, {}
+    ]  # fmt: skip
     ends += [{"arrived": True, "payload": go is not Phase.TARE, "go": go} for go in Phase]
     ends += [{"tare_used": False}, {"engaged": False}, {"released": True, "go": Phase.RETURN}]
     single = ("triggered", "pressed", "released", "contact_lost", "in_contact", "overtravel", "blind")
