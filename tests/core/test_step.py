@@ -179,7 +179,7 @@ def test_a_measured_dt_that_is_not_finite_is_told(log: Log, dt: float) -> None:
 def hovering() -> Flight:
     flight = Flight(CONFIG).run(0.4)
     flight.tick(Request.TAKEOFF)
-    return flight.until(lambda outputs: outputs.phase is Phase.HOLD, 20.0).run(1.0)
+    return flight.until(lambda outputs: outputs.phase is Phase.HOLD, 20.0).run(2.0)
 
 
 @pytest.mark.parametrize(
