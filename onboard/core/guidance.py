@@ -365,7 +365,7 @@ def _plan(phase: Phase, state: State, site: Site, params: AllParams) -> tuple[Le
         _adhesive(path, site, params)
     elif phase is Phase.TOOL_CHANGE:
         _arm_first(path, ready, plan.beside(site, site.near))
-        path.to(base=plan.beside(site, site.near), slow=True).to(arm=(p.press_reach, 0.0, 0.0))
+        path.to(base=plan.beside(site, site.near), yaw=site.yaw, slow=True).to(arm=(p.press_reach, 0.0, 0.0))
     elif phase is Phase.TARE:
         _arm_first(path, (p.press_reach, 0.0, 0.0), plan.beside(site, site.near))
         path.to(base=plan.beside(site, site.near), yaw=site.yaw, arm=(p.press_reach, 0.0, 0.0), slow=True)
@@ -397,7 +397,7 @@ def _arm_first(path: Path, arm: tuple[float, float, float], base: Vec3) -> None:
 
 
 def _adhesive(path: Path, site: Site, params: AllParams) -> None:
-    """Around the pipe at a distance to one end of the arc, in, along the arc with the pump, out, and back."""
+    """Off the pipe, around it at a distance to one end of the arc, in, along the arc with the pump, out, and back."""
     p = params.plan
     needle = params.pipe.radius + p.needle_gap
     clear = needle + p.needle_clear
@@ -413,8 +413,9 @@ def _adhesive(path: Path, site: Site, params: AllParams) -> None:
     def to(angle: float, radius: float) -> None:
         path.to(arm=plan.wrist_on_arc(angle, radius, params.pipe.radius, params.vehicle, p), slow=True)
 
-    to(0.0, clear)
-    sweep(0.0, first, clear, 2.0 * p.arm_speed, 0.0)
+    begin = min(last, max(first, -path.at[6] - 0.5 * pi))  # at rest anywhere on the arc, the needle is lifted off there
+    to(begin, clear)
+    sweep(begin, first, clear, 2.0 * p.arm_speed, 0.0)
     to(first, needle)
     scale = (needle + params.vehicle.arm.needle) / needle
     sweep(first, last, needle, p.needle_speed * scale, p.pump_ratio * needle * (last - first))

@@ -329,11 +329,26 @@ def test_the_tare_takes_out_what_is_read_at_rest() -> None:
     seen = pushed((0.2, -0.3, 0.4))
     state, believed = after(State(), LONG, seen, phase=Phase.TARE)
     assert believed.contact_force == pytest.approx(0.3, abs=1e-6)
-    state, _ = after(state, 100, seen, phase=Phase.TARE, progress=Progress(taring=True))
-    state, believed = after(state, 1, seen, phase=Phase.TARE, progress=Progress(taring=True, tared=True))
+    state, _ = after(state, 100, seen, phase=Phase.TARE, progress=Progress(tare_begun=True, taring=True))
+    state, believed = after(
+        state, 1, seen, phase=Phase.TARE, progress=Progress(tare_begun=True, taring=True, tared=True)
+    )
     assert believed.force_W == pytest.approx((0.0, 0.0, 0.0), abs=1e-4)
     state, believed = after(state, LONG, pushed((0.2, -1.3, 0.4)), phase=Phase.ADVANCE)
     assert believed.contact_force == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_tare_broken_off_leaves_nothing_for_the_next() -> None:
+    begun, taring = Progress(tare_begun=True), Progress(tare_begun=True, taring=True)
+    state, _ = after(State(), LONG, pushed((0.0, -3.0, 0.0)), phase=Phase.TARE, progress=taring)
+    state, _ = after(state, 1, pushed((0.0, -0.3, 0.0)), phase=Phase.HOLD)
+    assert state.observer.tare == (0.0, 0.0, 0.0)
+    state, _ = after(state, LONG, pushed((0.0, -0.3, 0.0)), phase=Phase.HOLD, progress=begun)
+    state, _ = after(state, 100, pushed((0.0, -0.3, 0.0)), phase=Phase.HOLD, progress=taring)
+    state, _ = after(state, 20, pushed((0.0, -0.3, 0.0)), phase=Phase.HOLD, progress=begun)  # moved for a moment
+    done = replace(taring, tared=True)
+    state, believed = after(state, 1, pushed((0.0, -0.3, 0.0)), phase=Phase.HOLD, progress=done)
+    assert believed.force_W == pytest.approx((0.0, 0.0, 0.0), abs=1e-4)
 
 
 # --- contact trigger --------------------------------------------------------------------------------------------------

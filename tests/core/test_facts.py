@@ -10,14 +10,14 @@ from msgspec.structs import replace
 
 from drivers.samples import Engage, FlightMode, Landed
 from onboard.config import load_config
-from onboard.core import compensation, facts, mission, safety
+from onboard.core import compensation, facts, mission, observer, safety
 from onboard.core import estimate as estimating
 from onboard.core.derived import derive
 from onboard.core.guidance import Progress
 from onboard.core.math3 import matrix_from_quat
-from onboard.core.types import Action, Estimate, Phase, Verdict
+from onboard.core.types import Action, Estimate, LinkState, Phase, Verdict
 from tests.core.following import RESTING, Follower
-from tests.core.sampled import JOINTS, autopilot, inputs, odometry, quat, servos
+from tests.core.sampled import JOINTS, T0, autopilot, inputs, odometry, quat, servos
 
 CONFIG = load_config("paper")
 DERIVED = derive(CONFIG)
@@ -181,6 +181,19 @@ def test_what_the_estimate_noticed_is_handed_on() -> None:
     assert (told.disagreement, told.confidence) == (0.07, 1)
 
 
+@pytest.mark.parametrize("seen", [SEEN, replace(SEEN, servos=None)], ids=["seen", "waiting"])
+def test_the_commander_s_age_counts_while_somebody_commands(seen: estimating.State) -> None:
+    for link, age in (
+        (LinkState("bench", T0 - 3_000_000_000, present=True), 3.0),
+        (LinkState("bench", T0 + 1_000_000, present=True), 0.0),  # heard while this tick was begun
+        (LinkState(), 0.0),
+        (LinkState("", T0 - 3_000_000_000), 0.0),
+    ):
+        told = facts.for_safety(seen, HIGH, inputs(link=link), Phase.HOLD, True, True, REFERENCE, None)
+        assert told.commander == link.commander
+        assert told.link_age == pytest.approx(age)
+
+
 # --- for the mission --------------------------------------------------------------------------------------------------
 
 
@@ -255,6 +268,13 @@ def test_blind_and_yielded_come_from_the_verdict() -> None:
     assert known(verdict=Verdict(Action.LAND, ("odometry_lost",))).blind
     assert not known(verdict=Verdict(Action.LAND, ("battery_critical",))).blind
     assert known(verdict=Verdict(Action.LAND, ("offboard_lost",))).offboard_lost
+
+
+def test_what_a_request_to_go_or_to_tare_depends_on() -> None:
+    told = known()
+    assert (told.go, told.payload, told.tare_used) == (Phase.ALIGN, True, CONFIG.observer.tare)
+    assert not known(believed=replace(HIGH, payload=False)).payload
+    assert known(replace(SEEN, observer=observer.State(tare=(0.1, 0.2, 0.3)))).tare == (0.1, 0.2, 0.3)
 
 
 # --- for the gate -----------------------------------------------------------------------------------------------------

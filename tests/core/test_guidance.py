@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from onboard.config import Config, load_config
 from onboard.core.derived import derive
-from onboard.core.guidance import BACKING_OUT, PRESSING, SMOOTH_START, STANDING
+from onboard.core.guidance import BACKING_OUT, PRESSING, READY_BACK, SMOOTH_START, STANDING
 from onboard.core.types import Phase, Reference
 from tests.core.following import CHAIN, DT, Follower, Step
 
@@ -196,6 +196,55 @@ def test_held_anywhere_the_needle_is_not_driven_into_the_pipe(moments: list[Foll
             assert min(needle_from_axis(s.reference) for s in follower.steps) > CONFIG.pipe.radius + 0.5 * P.needle_gap
             tried += 1
     assert tried > 50
+
+
+@pytest.mark.parametrize("nth", range(3))
+def test_resumed_anywhere_the_needle_keeps_off_and_dispenses_the_whole_arc(moments: list[Follower], nth: int) -> None:
+    for moment in [m for m in moments if m.steps[-1].phase is Phase.ADHESIVE][nth::9]:
+        follower = moment.copy()
+        follower.run(Phase.HOLD, 2.0).finish(Phase.ADHESIVE)
+        assert min(needle_from_axis(s.reference) for s in follower.steps) > CONFIG.pipe.radius + 0.5 * P.needle_gap
+        angles = [-s.reference.elevation - 0.5 * pi for s in follower.steps[2:] if s.reference.dispensing]
+        first, last = follower.site.arc
+        assert min(angles) == pytest.approx(first, abs=1e-3)
+        assert max(angles) == pytest.approx(last, abs=1e-3)
+
+
+# --- on the way to a phase beside the pipe ----------------------------------------------------------------------------
+
+
+def from_axis(follower: Follower) -> float:
+    """Least distance of needle, gripper and wrist from the pipe's axis, m, wherever base and tool are."""
+    arm, n, axis = CONFIG.vehicle.arm, follower.site.normal, CONFIG.pipe.position
+    least = 10.0
+    for _, reference, _ in follower.steps:
+        (forward, up), elevation = reference.wrist, reference.elevation
+        for length, angle in ((arm.needle, elevation + 0.5 * pi), (arm.gripper, elevation), (0.0, 0.0)):
+            ahead = arm.mount[0] + forward + length * cos(angle)
+            x = reference.p[0] - axis[0] + ahead * cos(reference.yaw)
+            y = reference.p[1] - axis[1] + ahead * sin(reference.yaw)
+            z = reference.p[2] - axis[2] + arm.mount[2] + up + length * sin(angle)
+            least = min(least, hypot(x * n[0] + y * n[1], z))
+    return least
+
+
+@pytest.mark.parametrize("to", [Phase.APPROACH, *CHAIN[3:7], Phase.RETURN])
+def test_after_a_retreat_from_anywhere_the_tools_keep_off_the_pipe(moments: list[Follower], to: Phase) -> None:
+    places = {Phase.ALIGN: "needle", Phase.ADHESIVE: "needle", Phase.TOOL_CHANGE: "near", Phase.TARE: "near"}
+    beside = [m for m in moments if m.steps[-1].phase in CHAIN[3:7]]
+    for moment in beside[:: len(beside) // 7]:
+        follower = moment.copy()
+        follower.finish(Phase.RETREAT_HOLD).run(Phase.HOLD, 0.2)
+        follower.steps = follower.steps[-1:]
+        follower.finish(to)
+        touching = CONFIG.pipe.radius + (0.9 * P.needle_gap if to in CHAIN[3:5] else 0.9 * P.gap)
+        assert from_axis(follower) > touching
+        last = follower.steps[-1].reference
+        if to in places:
+            assert follower.from_crack == pytest.approx(getattr(follower.site, places[to]), abs=1e-6)
+            assert sin(last.yaw - follower.site.yaw) == pytest.approx(0.0, abs=1e-9)
+            wanted = (P.press_reach, 0.0) if places[to] == "near" else (P.needle_reach - READY_BACK, 0.0)
+            assert last.wrist == pytest.approx(wanted)
 
 
 # --- contact ----------------------------------------------------------------------------------------------------------
@@ -399,6 +448,37 @@ def test_the_tare_is_taken_at_rest_and_long_enough(mission: list[Step]) -> None:
     assert sum(taring) * DT == pytest.approx(G.tare_time, abs=2.5 * DT)
     assert taring.index(True) * DT >= G.tare_settle
     assert [s.progress.tared for s in steps].index(True) == len(steps) - 1
+
+
+def test_a_tare_by_hand_is_taken_at_rest_in_hover_and_as_long() -> None:
+    follower = Follower(CONFIG).finish(Phase.PREFLIGHT).finish(Phase.TAKEOFF)
+    follower.run(Phase.HOLD, 2.0 * (G.tare_settle + G.tare_time))
+    assert not any(s.progress.taring or s.progress.tare_begun for s in follower.steps)
+    for _ in range(2):  # and another one, from the beginning
+        asked = len(follower.steps)
+        while not follower.tick(Phase.HOLD, tare=True).progress.tared:
+            assert (len(follower.steps) - asked) * DT < 20.0
+        steps = follower.steps[asked:]
+        assert all(s.progress.tare_begun for s in steps)
+        taring = [s.progress.taring for s in steps]
+        assert taring.index(True) * DT == pytest.approx(G.tare_settle, abs=2.5 * DT)
+        assert sum(taring) * DT == pytest.approx(G.tare_time, abs=2.5 * DT)
+        assert {s.reference.p for s in steps} == {steps[0].reference.p}
+        after = follower.tick(Phase.HOLD).progress
+        assert (after.tare_begun, after.taring, after.tared) == (False, False, False)
+
+
+def test_armed_it_stands_where_it_stood(mission: list[Step]) -> None:
+    follower = Follower(CONFIG).run(Phase.PREFLIGHT, 0.1)
+    before = follower.steps[-1].reference
+    follower.run(Phase.ARMED, 0.5)
+    assert {(s.reference.lift, s.reference.p, s.reference.wrist) for s in follower.steps[-100:]} == {
+        (0.0, before.p, before.wrist)
+    }
+    follower.finish(Phase.TAKEOFF)
+    assert follower.steps[-1].reference.p == pytest.approx(of(mission, Phase.TAKEOFF)[-1].p)
+    broken_off = Follower(CONFIG).run(Phase.PREFLIGHT, 0.1).run(Phase.ARMED, 0.1).run(Phase.LAND, 1.0)
+    assert {s.reference.lift for s in broken_off.steps} == {0.0}
 
 
 def test_without_an_estimate_nothing_is_begun() -> None:

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from itertools import islice, product
 from math import inf, nan
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -27,6 +28,7 @@ DOWN = replace(NOTHING, landed=True, disarmed=True)
 ON_GROUND = {Phase.PREFLIGHT, Phase.STOPPED}
 TOOL_IN_PIPE = {Phase.PRESS, Phase.RELEASE, Phase.RETREAT}
 LANDING = {Phase.LAND, Phase.RETREAT_LAND}
+STANDING = ON_GROUND | {Phase.ARMED}
 NOMINAL = [
     Phase.PREFLIGHT, Phase.TAKEOFF, Phase.APPROACH, Phase.ALIGN, Phase.ADHESIVE, Phase.TOOL_CHANGE, Phase.TARE,
     Phase.ADVANCE, Phase.PRESS, Phase.RELEASE, Phase.RETREAT, Phase.RETURN, Phase.LAND, Phase.STOPPED,
@@ -59,6 +61,8 @@ def demanded(phase: Phase, action: Action, state: State, facts: Facts, *, by_per
         return Phase.STOPPED
     if phase in ON_GROUND:
         return None
+    if phase is Phase.ARMED:
+        return Phase.LAND
     if phase is Phase.TAKEOFF and not facts.airborne and action is not Action.LAND:
         return Phase.LAND
     in_contact = phase in TOOL_IN_PIPE or facts.in_contact
@@ -77,13 +81,26 @@ def demanded(phase: Phase, action: Action, state: State, facts: Facts, *, by_per
     return None if phase is Phase.HOLD else Phase.HOLD
 
 
+def stopping(phase: Phase, facts: Facts) -> Action:
+    """What a stop asks for, where the vehicle is."""
+    if phase in {Phase.HOLD, Phase.RETREAT_HOLD, *STANDING, *LANDING}:
+        return Action.LAND
+    return Action.RETREAT if phase in TOOL_IN_PIPE or facts.in_contact else Action.HOLD
+
+
 def asked(phase: Phase, request: Request, state: State, facts: Facts) -> Phase | None:
     """Where a request leads; None: it is refused."""
+    if request is Request.STOP:
+        return demanded(phase, stopping(phase, facts), state, facts, by_person=True)
     if request in (Request.HOLD, Request.RETREAT, Request.LAND, Request.KILL):
         return demanded(phase, Action[request.name], state, facts, by_person=True)
     if request is Request.RESET:
         return Phase.PREFLIGHT if phase is Phase.STOPPED and facts.landed and facts.disarmed else None
-    if phase is Phase.PREFLIGHT and request in (Request.START, Request.TAKEOFF) and facts.ready:
+    if request is Request.ARM:
+        return Phase.ARMED if phase is Phase.PREFLIGHT and facts.ready else None
+    if request in (Request.START, Request.TAKEOFF) and (
+        phase is Phase.ARMED or (phase is Phase.PREFLIGHT and facts.ready)
+    ):
         return Phase.TAKEOFF
     if phase is not Phase.HOLD:
         return None
@@ -127,6 +144,13 @@ def test_every_phase_and_action(phase: Phase, action: Action) -> None:
             assert (after, said) == step(state, None, Action.NONE, facts, P, DT)
 
 
+def asks(request: Request, phase: Phase, facts: Facts) -> Action:
+    """How much a request asks for."""
+    if request is Request.STOP:
+        return stopping(phase, facts)
+    return Action[request.name] if request.name in Action.__members__ else Action.NONE
+
+
 @pytest.mark.parametrize("action", [Action.HOLD, Action.RETREAT, Action.LAND, Action.KILL])
 @pytest.mark.parametrize("request_", Request)
 @pytest.mark.parametrize("phase", Phase)
@@ -137,7 +161,7 @@ def test_the_more_severe_of_request_and_action_wins(phase: Phase, request_: Requ
         if request_ is Request.RESET:
             wanted = asked(phase, request_, state, facts)
             assert after == (mission.initial() if wanted else by_action)
-        elif request_.name not in Action.__members__ or Action[request_.name] < action:
+        elif asks(request_, phase, facts) < action:
             assert said[0][0] == "refused_outranked"
             assert action.name in said[0][2]
             assert after == by_action
@@ -204,7 +228,8 @@ def test_out_of_release_the_sleeve_decides() -> None:
 
 
 TIMEOUTS = {
-    Phase.PREFLIGHT: Phase.STOPPED, Phase.TAKEOFF: Phase.LAND, Phase.APPROACH: Phase.HOLD, Phase.ALIGN: Phase.HOLD,
+    Phase.PREFLIGHT: Phase.STOPPED, Phase.ARMED: Phase.LAND,
+    Phase.TAKEOFF: Phase.LAND, Phase.APPROACH: Phase.HOLD, Phase.ALIGN: Phase.HOLD,
     Phase.ADHESIVE: Phase.HOLD, Phase.TOOL_CHANGE: Phase.HOLD, Phase.TARE: Phase.HOLD,
     Phase.ADVANCE: Phase.RETREAT_HOLD, Phase.PRESS: Phase.RETREAT_HOLD, Phase.RELEASE: Phase.RETREAT_HOLD,
     Phase.RETREAT: Phase.RETREAT_HOLD, Phase.RETURN: Phase.HOLD, Phase.LAND: Phase.LAND, Phase.HOLD: Phase.LAND,
@@ -220,7 +245,7 @@ def test_every_timeout(phase: Phase) -> None:
         assert run(state).phase is Phase.STOPPED
         return
     limit = float(getattr(P, f"{phase.value}_timeout"))
-    before, said = step(State(phase, limit, clear=False), None, Action.NONE, FLYING, P, DT)
+    before, said = step(State(phase, limit, clear=False, armed=True), None, Action.NONE, FLYING, P, DT)
     assert (before.phase, before.phase_time, said) == (phase, limit + DT, ())
     after, said = step(before, None, Action.NONE, FLYING, P, DT)
     assert (after.phase, after.phase_time) == (TIMEOUTS[phase], 0.0)
@@ -338,7 +363,7 @@ def test_on_the_ground_nobody_takes_command() -> None:
 
 @pytest.mark.parametrize("phase", Phase)
 def test_what_is_wanted_of_the_autopilot(phase: Phase) -> None:
-    wanted = Engage.IDLE if phase in ON_GROUND else Engage.OFFBOARD
+    wanted = Engage.IDLE if phase in ON_GROUND else Engage.OFFBOARD  # ARMED included: the motors are to idle
     assert mission.engage(State(phase, 0.0), FLYING) is wanted
     assert mission.engage(State(phase, 0.0, killed=True), FLYING) is Engage.KILL
     down = Engage.IDLE if phase in ON_GROUND | {Phase.LAND} else Engage.OFFBOARD
@@ -353,21 +378,231 @@ def test_kill_lasts_until_reset_on_the_ground() -> None:
     assert run(state, Request.RESET, Action.KILL, DOWN) == mission.initial()
 
 
+# --- stop, arm, tare, go ----------------------------------------------------------------------------------------------
+
+
+#: Stop asked for again and again: the phases it leads through while nothing else happens, and the last refusal.
+STOPS = {
+    Phase.PREFLIGHT: ([], "refused_grounded"), Phase.STOPPED: ([], "refused_grounded"),
+    Phase.ARMED: ([Phase.LAND], "refused_landing_already"),
+    **dict.fromkeys(sorted(WORK - TOOL_IN_PIPE - {Phase.ARMED}), ([Phase.HOLD, Phase.LAND], "refused_landing_already")),
+    **dict.fromkeys(sorted(TOOL_IN_PIPE), ([Phase.RETREAT_HOLD, Phase.RETREAT_LAND], "refused_landing_already")),
+    Phase.HOLD: ([Phase.LAND], "refused_landing_already"),
+    Phase.RETREAT_HOLD: ([Phase.RETREAT_LAND], "refused_landing_already"),
+    Phase.RETREAT_LAND: ([], "refused_landing_already"), Phase.LAND: ([], "refused_landing_already"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("phase", Phase)
+def test_stop_again_and_again(phase: Phase) -> None:
+    state, (way, refusal) = State(phase, 1.0, clear=False), STOPS[phase]
+    for wanted in way:
+        state = run(state, Request.STOP)
+        assert state.phase is wanted
+    for _ in range(3):
+        after, said = step(state, Request.STOP, Action.NONE, FLYING, P, DT)
+        assert after.phase is state.phase
+        assert (said[0][0], said[0][2][:13]) == (refusal, "stop refused.")
+
+
+def test_stop_in_a_takeoff_that_still_stands_breaks_it_off() -> None:
+    state = run(State(Phase.TAKEOFF, 1.0), Request.STOP, facts=replace(FLYING, airborne=False))
+    assert state.phase is Phase.LAND
+    assert run(state, Request.STOP, facts=DOWN).phase is Phase.STOPPED
+
+
+def test_stop_holds_a_mission_that_was_given_up_before_it_lands_it() -> None:
+    state = State(Phase.RETREAT_HOLD, 1.0, clear=False, giving_up=True)
+    state = run(state, Request.STOP)
+    assert (state.phase, state.giving_up) == (Phase.RETREAT_HOLD, False)
+    assert run(state, facts=replace(FLYING, arrived=True)).phase is Phase.HOLD
+    assert run(state, Request.STOP).phase is Phase.RETREAT_LAND
+    landing = run(State(Phase.RETREAT_HOLD, 1.0, giving_up=True), Request.LAND)
+    assert run(landing, Request.STOP).phase is Phase.RETREAT_LAND, "a stop undoes no landing"
+
+
+READY = replace(NOTHING, ready=True, landed=True, disarmed=True)
+IDLING = replace(NOTHING, engaged=True, landed=True)
+
+
+def armed() -> State:
+    """Standing with the motors idling, as the autopilot has said."""
+    state = run(mission.initial(), Request.ARM, facts=READY)
+    assert state.phase is Phase.ARMED
+    assert mission.engage(state, READY) is Engage.OFFBOARD
+    for _ in range(100):
+        state, said = step(state, None, Action.NONE, DOWN, P, DT)
+        assert said == ()
+    state, said = step(state, None, Action.NONE, IDLING, P, DT)
+    assert [code for code, _, _ in said] == ["armed"]
+    assert (state.phase, state.phase_time, step(state, None, Action.NONE, IDLING, P, DT)[1]) == (Phase.ARMED, 0.0, ())
+    return state
+
+
+def test_arm_waits_for_the_takeoff() -> None:
+    for request, mode in ((Request.TAKEOFF, "takeoff"), (Request.START, "mission")):
+        for state in (armed(), State(Phase.ARMED, 0.0)):  # also before the autopilot has armed
+            after = run(state, request, facts=IDLING)
+            assert (after.phase, after.mode, after.armed) == (Phase.TAKEOFF, mode, False)
+
+
+@pytest.mark.parametrize("by", [Request.HOLD, Request.RETREAT, Request.LAND, Request.STOP, "HOLD", "RETREAT", "LAND"])
+def test_whatever_breaks_arming_off_disarms(by: Request | str) -> None:
+    if isinstance(by, Request):
+        state, said = step(armed(), by, Action.NONE, IDLING, P, DT)
+    else:
+        state, said = step(armed(), None, Action[by], IDLING, P, DT)
+    assert (state.phase, said[0][0]) == (Phase.LAND, "disarm")
+    assert mission.engage(state, IDLING) is Engage.IDLE
+    state = run(state, facts=DOWN)
+    assert (state.phase, state.completed) == (Phase.STOPPED, False)
+    assert run(state, Request.RESET, facts=DOWN) == mission.initial()
+
+
+def test_arming_that_fails_or_does_not_last_is_told() -> None:
+    waiting = run(mission.initial(), Request.ARM, facts=READY)
+    late, said = step(replace(waiting, phase_time=LATE), None, Action.NONE, DOWN, P, DT)
+    assert (late.phase, said[0][0], said[0][1]) == (Phase.LAND, "timeout_arming", Severity.ERROR)
+    late, said = step(replace(armed(), phase_time=LATE), None, Action.NONE, IDLING, P, DT)
+    assert (late.phase, said[0][0], said[0][1]) == (Phase.LAND, "timeout_armed", Severity.WARNING)
+    for lost in (DOWN, replace(IDLING, engaged=False)):
+        after, said = step(armed(), None, Action.NONE, lost, P, DT)
+        assert (after.phase, said[0][0], said[0][1]) == (Phase.LAND, "disarmed", Severity.ERROR)
+
+
+STILL = replace(FLYING, arrived=True)
+
+
+def test_a_tare_by_hand_ends_by_itself_and_tells_the_force() -> None:
+    state, said = step(State(Phase.HOLD, 9.0), Request.TARE, Action.NONE, STILL, P, DT)
+    assert (state.phase, state.taring, state.phase_time, said[0][0]) == (Phase.HOLD, True, 0.0, "tare_by_hand")
+    for _ in range(100):
+        state, said = step(state, None, Action.NONE, FLYING, P, DT)
+        assert (state.taring, said) == (True, ())
+    tared = replace(STILL, tared=True, tare=(0.123, -0.456, 1.0))
+    done, said = step(state, None, Action.NONE, tared, P, DT)
+    assert (done.phase, done.taring) == (Phase.HOLD, False)
+    assert [(code, text) for code, _, text in said] == [
+        ("tared", "Tared: +0.12, -0.46, +1.00 N along the body's x, y, z count as no force from now on.")
+    ]
+    twice = step(done, None, Action.NONE, tared, P, DT)[1]
+    assert twice == (), "told once"
+    at_once = step(state, Request.LAND, Action.NONE, tared, P, DT)[1]
+    assert [code for code, _, _ in at_once] == ["tared", "land"], "done in the tick in which the hover ends"
+    for request, action in ((Request.LAND, Action.NONE), (Request.START, Action.NONE), (None, Action.LAND)):
+        after, said = step(replace(state, mode="takeoff"), request, action, STILL, P, DT)
+        assert not after.taring
+        assert said[0][0] == "tare_broken_off"
+
+
+@pytest.mark.parametrize(
+    ("state", "facts", "code"),
+    [
+        (State(Phase.HOLD, 1.0), FLYING, "refused_moving"),
+        (State(Phase.HOLD, 1.0, clear=False), STILL, "refused_beside"),
+        (State(Phase.HOLD, 1.0), replace(STILL, in_contact=True), "refused_beside"),
+        (State(Phase.HOLD, 1.0, taring=True), STILL, "refused_taring"),
+        (State(Phase.HOLD, 1.0), replace(STILL, tare_used=False), "refused_tare_unused"),
+        (State(Phase.RETREAT_HOLD, 1.0), FLYING, "refused_retreating"),
+        (State(Phase.RETREAT_LAND, 1.0), FLYING, "refused_landing"),
+        (State(Phase.LAND, 1.0), FLYING, "refused_landing"),
+        (State(Phase.PREFLIGHT, 1.0), READY, "refused_grounded"),
+        (State(Phase.ARMED, 1.0), IDLING, "refused_grounded"),
+        (State(Phase.STOPPED, 1.0), DOWN, "refused_grounded"),
+        *((State(phase, 1.0), FLYING, "refused_hold_first") for phase in sorted(WORK)),
+    ],
+)
+def test_a_tare_is_refused_where_it_cannot_be_right(state: State, facts: Facts, code: str) -> None:
+    after, said = step(state, Request.TARE, Action.NONE, facts, P, DT)
+    assert after.taring is state.taring
+    assert said[0][0] == code
+
+
+GO = {Phase.APPROACH, Phase.ALIGN, Phase.ADHESIVE, Phase.TOOL_CHANGE, Phase.TARE, Phase.RETURN}
+FORCE = {Phase.ADVANCE, Phase.PRESS, Phase.RELEASE}
+
+
+def go(state: State, to: Phase | None, facts: Facts = STILL) -> tuple[State, str]:
+    """A request to go, and what was said first."""
+    after, said = step(state, Request.GO, Action.NONE, replace(facts, go=to), P, DT)
+    assert not said[0][0].startswith("refused") or after == run(state, facts=facts)
+    return after, said[0][0]
+
+
+@pytest.mark.parametrize("to", Phase)
+def test_going_from_hover(to: Phase) -> None:
+    """After a takeoff, with nothing interrupted: to the pipe, or home."""
+    hover = State(Phase.HOLD, 1.0, mode="takeoff", attempts=2)
+    after, code = go(hover, to)
+    if to in (Phase.APPROACH, Phase.RETURN):
+        assert (after.phase, after.attempts, after.homeward) == (to, 0, False)
+        assert code == ("go" if to is Phase.APPROACH else "go_return")
+    elif to in FORCE:
+        assert code == "refused_go_to_contact"
+    else:
+        assert code == ("refused_go_far_off" if to in GO else "refused_go_elsewhere")
+
+
+@pytest.mark.parametrize("to", sorted(GO))
+@pytest.mark.parametrize("phase", sorted(WORK - {Phase.TAKEOFF, Phase.APPROACH, Phase.RETURN}))
+def test_going_after_work_beside_the_pipe(phase: Phase, to: Phase) -> None:
+    held = run(State(phase, 1.0, clear=False), Request.HOLD)
+    if held.phase is Phase.HOLD:  # no contact: it hovers where it was
+        assert go(held, to)[1] == "refused_beside"
+        held = run(held, Request.RETREAT)
+    assert go(held, to)[1] == "refused_retreating"
+    held = run(held, facts=STILL)
+    after, code = go(held, to)
+    assert (after.phase, after.resume_phase) == (to, None)
+    assert code == ("go_return" if to is Phase.RETURN else "go")
+    empty = replace(STILL, payload=False)
+    if to is not Phase.RETURN:
+        assert go(held, to, empty)[1] == "refused_without_sleeve"
+        return
+    home, _ = go(held, to, replace(empty, released=True))
+    for over, completed in ((home, True), (after, False)):
+        landed = run(run(over, facts=STILL), facts=DOWN)
+        assert (landed.phase, landed.completed) == (Phase.STOPPED, completed)
+
+
+def test_an_approach_on_hold_is_free_to_go_home() -> None:
+    held = run(State(Phase.APPROACH, 1.0, clear=False), Request.HOLD)
+    home, _ = go(held, Phase.RETURN)
+    assert home.phase is Phase.RETURN
+    assert go(run(home, Request.HOLD), Phase.APPROACH)[0].phase is Phase.APPROACH
+    assert go(held, Phase.TARE)[1] == "refused_go_far_off"
+
+
+def test_going_nowhere_and_from_elsewhere_is_refused() -> None:
+    assert go(State(Phase.HOLD, 1.0), None)[1] == "refused_go_nowhere"
+    wanted = {
+        **dict.fromkeys(WORK, "refused_hold_first"), **dict.fromkeys(LANDING, "refused_landing"),
+        **dict.fromkeys(STANDING, "refused_grounded"), Phase.RETREAT_HOLD: "refused_retreating",
+    }  # fmt: skip
+    for phase, code in wanted.items():
+        assert go(State(phase, 1.0), Phase.APPROACH, FLYING)[1] == code
+
+
+def test_a_refused_way_is_named() -> None:
+    text = step(State(Phase.HOLD, 1.0), Request.GO, Action.NONE, replace(STILL, go=Phase.PRESS), P, DT)[1][0][2]
+    assert text == "go refused. Only the tare leads to press: ask to go to tare."
+
+
 # --- everything that can happen ---------------------------------------------------------------------------------------
+
+LATE = 1e6
 
 
 def stimuli() -> list[tuple[Request | None, Action, Facts]]:
     """Requests and actions beside the facts that change the answer, in the air and on the ground."""
-    ends = ("arrived", "triggered", "pressed", "released", "contact_lost", "in_contact", "overtravel", "blind")
+    ends = ("arrived", "triggered", "pressed", "released", "contact_lost", "in_contact", "overtravel", "blind", "tared")
     some = [
+        *(replace(FLYING, arrived=True, go=go) for go in GO), replace(FLYING, go=Phase.ALIGN, payload=False),
         FLYING, NOTHING, DOWN, replace(NOTHING, ready=True), replace(FLYING, offboard_lost=True),
         replace(FLYING, arrived=True, tared=True), *(replace(FLYING, **{name: True}) for name in ends),
     ]  # fmt: skip
     found: list[tuple[Request | None, Action, Facts]] = [(request, Action.NONE, f) for request in Request for f in some]
     return found + [(None, action, f) for action in Action for f in some]
-
-
-LATE = 1e6
 
 
 def explore() -> dict[State, list[tuple[tuple[Request | None, Action, Facts], State]]]:
@@ -403,6 +638,14 @@ def test_every_reachable_state() -> None:
                 cut = request is Request.KILL or action is Action.KILL
                 given_away = facts.offboard_lost or state.yielded
                 assert after.phase in ways_out | onward or cut or given_away
+            if state.phase is Phase.HOLD and after.phase in GO and request is Request.GO:
+                assert after.phase is facts.go
+                assert facts.payload or after.phase is Phase.RETURN
+                assert state.clear or state.resume_phase is Phase.APPROACH
+            if after.phase is Phase.ARMED and moved:
+                assert request is Request.ARM
+            if after.taring:
+                assert (after.phase, after.clear) == (Phase.HOLD, True)
             if state.phase is Phase.HOLD and moved and request is None:
                 assert after.phase in {Phase.LAND, Phase.RETREAT_LAND, Phase.RETREAT_HOLD, Phase.STOPPED}
             if after.phase is Phase.RELEASE and moved and request is None:
@@ -410,7 +653,7 @@ def test_every_reachable_state() -> None:
             if after.completed and not state.completed:
                 assert (state.phase, state.homeward) == (Phase.LAND, True)
             if after.homeward and not state.homeward:
-                assert state.phase is Phase.RETREAT or state.resume_phase is Phase.RELEASE
+                assert state.phase is Phase.RETREAT or facts.released
             if after.phase is Phase.STOPPED and moved and not after.killed:
                 assert state.phase is Phase.PREFLIGHT or (facts.landed and facts.disarmed)
             assert not (state.killed and moved) or request is Request.RESET
@@ -439,17 +682,22 @@ def test_every_row_of_the_table_can_fire() -> None:
         for state, facts in [*situations(phase), *endings(phase)]
     }
     assert [row for row in mission.TABLE if id(row) not in fired] == []
-    assert {row.code for row in mission.TABLE} | {"refused_outranked"} == set(mission.SENTENCES)
+    assert {row.code for row in mission.TABLE} | {"refused_outranked", "tare_broken_off"} == set(mission.SENTENCES)
 
 
 def endings(phase: Phase) -> Iterator[tuple[State, Facts]]:
     """What facts alone may depend on: one at a time, with the flags of the state."""
-    ends = [{"arrived": True}, {"arrived": True, "tared": True}, {"landed": True, "disarmed": True}, {}]
+    ends: list[dict[str, Any]] = [
+        {"arrived": True}, {"arrived": True, "tared": True}, {"landed": True, "disarmed": True}, {}
+    ]  # fmt: skip
+    ends += [{"arrived": True, "payload": go is not Phase.TARE, "go": go} for go in Phase]
+    ends += [{"tare_used": False}, {"engaged": False}, {"released": True, "go": Phase.RETURN}]
     single = ("triggered", "pressed", "released", "contact_lost", "in_contact", "overtravel", "blind")
     for end in [*ends, *({name: True} for name in single)]:
         facts = replace(FLYING, **end)
         for time, flag in product((0.0, LATE), (True, False)):
-            yield State(phase, time, giving_up=flag, homeward=flag), facts
+            yield State(phase, time, giving_up=flag, homeward=flag, armed=flag, taring=flag), facts
+            yield State(phase, time, resume_phase=Phase.ALIGN, clear=flag), facts
             yield State(phase, time, mode="takeoff", attempts=99, yielded=flag, killed=flag), facts
 
 
@@ -457,4 +705,5 @@ def test_rows_name_real_parameters() -> None:
     for phase in set(Phase) - {Phase.STOPPED}:
         assert getattr(P, f"{phase.value}_timeout") > 0.0
     for code, (_, text) in mission.SENTENCES.items():
-        assert text.format(phase="ALIGN", attempt=1, max=3, action="LAND").endswith("."), code
+        words = {"phase": "ALIGN", "attempt": 1, "max": 3, "action": "LAND", "go": "align", "tare": "+0.10"}
+        assert text.format(**words).endswith("."), code

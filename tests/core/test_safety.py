@@ -90,6 +90,9 @@ CASES = [
     Case("force_high", {"contact_force": -8.0}, {"contact_force": -8.1}, 0.1, RETREAT, RETREAT, also=("contact_lost",)),
     Case("contact_lost", {"contact_force": 0.05}, {"contact_force": 0.049}, 0.5, WARN, WARN, base=PRESSING),
     Case("contact_stray", {"free_flight_force": 5.0}, {"free_flight_force": 5.1}, 0.5, RETREAT, Action.NONE),
+    Case("link_silent", {"commander": "bench", "link_age": 2.0}, {"commander": "bench", "link_age": 2.01}, 0.0, HOLD,
+         RETREAT),
+    Case("link_lost", {"link_age": 10.0}, {"link_age": 10.1}, 0.0, LAND, LAND, also=("link_silent",)),
     Case("battery_low", {"battery_remaining": 0.25}, {"battery_remaining": 0.249}, 2.0, RETREAT, RETREAT, latched=True),
     Case("battery_low", {"battery_voltage": 14.0}, {"battery_voltage": 13.9}, 2.0, RETREAT, RETREAT, latched=True),
     Case("battery_critical", {"battery_remaining": 0.12}, {"battery_remaining": 0.119}, 2.0, LAND, LAND, latched=True,
@@ -203,6 +206,24 @@ def test_a_tipped_vehicle_is_cut_on_the_ground_too_but_only_when_armed() -> None
     ticks = lasting(0.4)
     assert hold(safety.initial(), tipped, ticks)[1] is NOMINAL
     assert hold(safety.initial(), replace(tipped, armed=True), ticks)[1] == Verdict(KILL, ("tipped",))
+
+
+def test_armed_on_the_ground_counts_as_flight() -> None:
+    """Motors idle: what would hold a flight disarms. That the vehicle is not in the air is known all the same."""
+    idling = replace(GROUND, phase=Phase.ARMED, armed=True)
+    assert step(CLEAR, idling, P, DT)[1] is NOMINAL
+    assert step(CLEAR, replace(idling, link_age=2.5), P, DT)[1].action is HOLD
+    assert hold(CLEAR, replace(idling, tilt=3.0), lasting(P.tipped_time))[1].action is KILL
+    assert hold(CLEAR, replace(idling, armed=False, joint_error=3.0, offboard_lost=True), 1000)[1] is NOMINAL
+
+
+def test_a_station_heard_again_is_told_and_that_is_all() -> None:
+    state, verdict, codes = hold(CLEAR, replace(GOOD, commander="bench", link_age=12.0), 10)
+    assert (verdict.action, codes) == (LAND, ["link_silent", "link_lost"])
+    state, verdict, codes = hold(state, replace(GOOD, commander="bench", link_age=0.1), lasting(P.clear_time))
+    assert (verdict, codes) == (NOMINAL, ["link_silent_cleared", "link_lost_cleared"])
+    said = step(CLEAR, replace(GOOD, commander="bench", link_age=2.5), P, DT)[2]
+    assert said[0][2].startswith("bench commands, and is silent for 2.5 s.")
 
 
 def test_landing_is_told_from_a_crash_and_the_ground_from_a_pipe() -> None:

@@ -44,7 +44,7 @@ def sampled(flight: Flight, request: Request | None = None) -> Inputs:
     """The inputs of the next tick."""
     return Inputs(
         round(flight.world.time * 1e9), PERIOD,
-        flight.odometry.latest(), flight.autopilot.latest(), flight.servos.latest(), request,
+        flight.odometry.latest(), flight.autopilot.latest(), flight.servos.latest(), request, link=flight.link,
     )  # fmt: skip
 
 
@@ -73,6 +73,22 @@ def test_the_state_survives_json_to_the_bit(log: Log, moment: str) -> None:
         state, outputs = step(state, seen, flight.config, PERIOD)
         assert outputs == flight.tick()
         assert state == flight.state
+
+
+@pytest.mark.parametrize("request_", [Request.STOP, Request.ARM, Request.TARE, Request.GO])
+def test_every_input_is_in_the_log_to_the_bit(log: Log, request_: Request) -> None:
+    """What a log keeps of the inputs gives the same state and outputs again."""
+    flight = log.at("adhesive").command_from("bench")
+    flight.tick(Request.HOLD)
+    flight.run(1.0).reached = False
+    flight.run(1.99)  # the link is lost within the ticks that are compared
+    for i in range(25):
+        before, asked = flight.state, request_ if i == 12 else None
+        outputs = flight.tick(asked, go=Phase.RETURN if asked is Request.GO else None)
+        kept = msgspec.json.decode(msgspec.json.encode(flight.inputs), type=Inputs)
+        assert kept == flight.inputs
+        assert step(before, kept, flight.config, kept.dt) == (flight.state, outputs)
+    assert "link_silent" in flight.said
 
 
 def test_the_initial_state_survives_json() -> None:
@@ -163,7 +179,7 @@ def test_a_measured_dt_that_is_not_finite_is_told(log: Log, dt: float) -> None:
 def hovering() -> Flight:
     flight = Flight(CONFIG).run(0.4)
     flight.tick(Request.TAKEOFF)
-    return flight.until(lambda outputs: outputs.phase is Phase.HOLD, 20.0).run(1.0)
+    return flight.until(lambda outputs: outputs.phase is Phase.HOLD, 20.0).run(2.0)
 
 
 @pytest.mark.parametrize(
@@ -175,13 +191,17 @@ def hovering() -> Flight:
         (Request.RESUME, Phase.HOLD, "refused_nothing"),
         (Request.RETREAT, Phase.HOLD, "refused_clear"),
         (Request.LAND, Phase.LAND, "land"),
+        (Request.STOP, Phase.LAND, "land"),
+        (Request.ARM, Phase.HOLD, "refused_flying"),
+        (Request.TARE, Phase.HOLD, "tare_by_hand"),
+        (Request.GO, Phase.APPROACH, "go"),
         (Request.KILL, Phase.STOPPED, "killed"),
         (Request.RESET, Phase.HOLD, "refused_reset"),
     ],
 )
 def test_every_request_in_hover(hovering: Flight, request_: Request, phase: Phase, code: str) -> None:
     flight = hovering.copy()
-    outputs = flight.tick(request_)
+    outputs = flight.tick(request_, go=Phase.APPROACH)
     assert outputs.phase is phase
     assert [event.code for event in outputs.events] == [code]
     assert outputs.events[0].t_ns == flight.inputs.t_ns if flight.inputs else False

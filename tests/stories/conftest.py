@@ -20,6 +20,7 @@ MOMENTS = (
     ("advance", Phase.ADVANCE, 2.0),
     ("press", Phase.PRESS, 8.5),
     ("release", Phase.RELEASE, 0.08),
+    ("retreat", Phase.RETREAT, 1.0),
     ("landing", Phase.LAND, 1.5),
 )
 #: The paper's mission with a short hold.
@@ -52,6 +53,12 @@ class Log:
 def at() -> At:
     """``at(name)``: a flight that begins at that moment of ``MOMENTS``."""
     return Log().at
+
+
+@pytest.fixture
+def ground() -> Flight:
+    """On the ground, preflight passed."""
+    return Flight(load_config("paper", sets=SETS)).run(0.4)
 
 
 @pytest.fixture(scope="session")

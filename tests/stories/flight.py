@@ -13,7 +13,7 @@ from drivers.samples import Landed
 from onboard.config import Config
 from onboard.core.derived import derive
 from onboard.core.step import State, initial_state, step
-from onboard.core.types import Action, Event, Inputs, Outputs, Phase, Request
+from onboard.core.types import Action, Event, Inputs, LinkState, Outputs, Phase, Request
 from onboard.devices import world_of
 from sim_backend import layout as at
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
@@ -59,6 +59,8 @@ class Flight:
         self.odometry = Spoilt(MockOdometry(world))
         self.autopilot = Spoilt(MockAutopilot(world))
         self.servos = Spoilt(MockServos(world))
+        self.link = LinkState()
+        self.reached = False
         self.events: list[Event] = []
         self.phases: list[Phase] = [] if self.outputs is None else [self.outputs.phase]
 
@@ -70,11 +72,20 @@ class Flight:
         twin._begin()
         return twin
 
-    def tick(self, request: Request | None = None, period: float = PERIOD) -> Outputs:
+    def command_from(self, station: str) -> Flight:
+        """From now on a station commands, and is heard in every tick while it is in reach."""
+        self.reached = True
+        self.link = LinkState(station, round(self.world.time * 1e9), present=True)
+        return self
+
+    def tick(self, request: Request | None = None, period: float = PERIOD, *, go: Phase | None = None) -> Outputs:
         """One cycle of the core, then ``period`` seconds of the world."""
+        now = round(self.world.time * 1e9)
+        if self.reached:
+            self.link = replace(self.link, heard_ns=now)
         self.inputs = Inputs(
-            round(self.world.time * 1e9), self._elapsed,
-            self.odometry.latest(), self.autopilot.latest(), self.servos.latest(), request,
+            now, self._elapsed, self.odometry.latest(), self.autopilot.latest(), self.servos.latest(), request, (),
+            go, self.link,
         )  # fmt: skip
         self.state, outputs = step(self.state, self.inputs, self.config, self.inputs.dt)
         self.autopilot.command(outputs.autopilot)
@@ -165,6 +176,15 @@ class Flight:
         """How far the gripper is in front of where the crack is believed, m."""
         site, tip = derive(self.config).site, self.truth.tip_W
         return (site.crack[0] - tip[0]) * site.normal[0] + (site.crack[1] - tip[1]) * site.normal[1]
+
+    # --- the link ---------------------------------------------------------------------------------------------------
+
+    def without_link(self, seconds: float) -> Flight:
+        """Go on for so long without a word of the commanding station, which is then in reach again."""
+        self.reached = False
+        self.run(seconds)
+        self.reached = True
+        return self
 
     # --- faults of the world ----------------------------------------------------------------------------------------
 

@@ -45,6 +45,26 @@ def test_land(at: At, moment: str) -> None:
     assert "stopped" in flight.said
 
 
+@pytest.mark.parametrize("moment", ["spool", *IN_AIR, "retreat"])
+def test_stop_and_stop_again(at: At, moment: str) -> None:
+    flight = at(moment)
+    before = flight.phases[-1]
+    flight.tick(Request.STOP)
+    first = {
+        "spool": Phase.LAND, "landing": Phase.LAND, "press": Phase.RETREAT_HOLD, "release": Phase.RETREAT_HOLD,
+        "retreat": Phase.RETREAT_HOLD,
+    }.get(moment, Phase.HOLD)  # fmt: skip
+    flight.is_in(first)
+    flight.run(1.0).tick(Request.STOP)
+    if first is Phase.LAND:
+        assert flight.said[-1] in ("refused_landing_already", "refused_grounded")
+    else:
+        flight.is_in(Phase.RETREAT_LAND if first is Phase.RETREAT_HOLD else Phase.LAND)
+    flight.until(lambda outputs: outputs.phase is Phase.STOPPED, 30.0).run(0.5).is_down()
+    assert flight.tick(Request.STOP).events[-1].code == "refused_grounded"
+    assert before not in flight.phases[1:] or before is Phase.LAND
+
+
 @pytest.mark.parametrize("moment", IN_AIR)
 def test_kill(at: At, moment: str) -> None:
     flight = at(moment)
