@@ -48,7 +48,7 @@ def add_parser(commands: Any) -> None:
         "lease", help=words, description=words.capitalize() + ".", epilog=_EPILOG, formatter_class=raw
     )
     actions = lease.add_subparsers(required=True, dest="action", metavar="ACTION")
-    words = "take command, and stay there as long as you command; Ctrl-C gives it back"
+    words = "take command, and stay there as long as you command"
     take = actions.add_parser("take", help=words, description=words.capitalize() + ".")
     take.add_argument("--seize", action="store_true", help="even from a station that commands now")
     words = "command no more; a flying vehicle is not left: land it, or let another station seize it"
