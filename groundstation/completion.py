@@ -40,9 +40,9 @@ def add_parser(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run ``completion``; gives the exit code."""
-    import argcomplete
+    from argcomplete.shell_integration import shellcode
 
-    print(argcomplete.shellcode(["pipewright"], shell=options.shell))
+    print(shellcode(["pipewright"], shell=options.shell))
     return codes.DONE
 
 
@@ -53,7 +53,7 @@ def complete(parser: argparse.ArgumentParser) -> None:
     import argcomplete
 
     attach(parser)
-    argcomplete.autocomplete(parser, always_complete_options="long")
+    argcomplete.autocomplete(parser, always_complete_options=False)
 
 
 def attach(parser: argparse.ArgumentParser) -> None:

@@ -44,7 +44,8 @@ def add_parser(commands: Any) -> None:
     words = "make a key and a certificate for a person or a machine"
     add = what.add_parser("add", help=words, description=words.capitalize() + ".")
     add.add_argument("name", metavar="NAME", help="of the person or machine; for good")
-    add.add_argument("--role", type=Role, choices=list(Role), required=True, metavar="|".join(Role))
+    words = "what it is: may watch and stop, may command, or is a vehicle"
+    add.add_argument("--role", type=Role, choices=list(Role), required=True, metavar="|".join(Role), help=words)
     add.add_argument(
         "--host",
         action="append",

@@ -27,7 +27,7 @@ examples:
   pipewright lease release
 
 A vehicle wants its commander to be there all the time. `lease take` is: it keeps the link, and shows how the vehicle
-is. `pipewright watch` does the same on a whole screen. All commands of the same station name then act under the lease.
+is. `pipewright watch --lease` does so on a whole screen. All commands of the same station name then act under it.
 """
 _LOOK: Final = 0.1
 #: A second Ctrl-C within this time leaves a flying vehicle, s.
@@ -48,12 +48,13 @@ def add_parser(commands: Any) -> None:
         "lease", help=words, description=words.capitalize() + ".", epilog=_EPILOG, formatter_class=raw
     )
     actions = lease.add_subparsers(required=True, dest="action", metavar="ACTION")
-    words = "take command, and stay there as long as you command; Ctrl-C gives it back"
+    words = "take command, and stay there as long as you command"
     take = actions.add_parser("take", help=words, description=words.capitalize() + ".")
     take.add_argument("--seize", action="store_true", help="even from a station that commands now")
     words = "command no more; a flying vehicle is not left: land it, or let another station seize it"
     release = actions.add_parser("release", help=words, description=words.capitalize() + ".")
     for parser in (take, release):
+        parser.formatter_class, parser.epilog = raw, station.examples_of(parser.prog, _EPILOG)
         station.add_options(parser)
         parser.set_defaults(run=run)
 

@@ -141,12 +141,14 @@ def _wait(client: Client, options: argparse.Namespace, printer: Printer, order: 
 
 def _passed(goal: Phase) -> Callable[[Phase], bool]:
     """Whether a phase has been gone through; or what came instead of it has ended."""
+    later = GOALS[GOALS.index(goal.value) + 1 :]
     seen = False
 
     def ended(phase: Phase) -> bool:
         nonlocal seen
         seen = seen or phase is goal
-        return phase in AT_REST or (seen and phase is not goal)
+        # one that is shorter than the time between two looks is not seen
+        return phase in AT_REST or phase.value in later or (seen and phase is not goal)
 
     return ended
 

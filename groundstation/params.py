@@ -27,7 +27,7 @@ examples:
   pipewright params diff desk --config my-vehicle.yaml        from desk to my-vehicle.yaml
   pipewright params save runs/desk-007 --config my-vehicle.yaml   the file then makes what that run flew with
 
-  pipewright params set guidance.speed=0.4                    in the vehicle, at once: all, or none
+  pipewright params set guidance.settle_time=1               in the vehicle, at once: all, or none
   pipewright params reload                                    the vehicle reads its files again
   pipewright params diff desk --vehicle falcon                from desk to what falcon flies with
   pipewright params save                                      the vehicle's files then make what it flies with
@@ -68,7 +68,8 @@ def add_parser(commands: Any) -> None:
             "in a vehicle: into its files what is in force",
         ),
     ):
-        parser = actions.add_parser(action, help=words, description=words.capitalize() + ".")
+        parser = actions.add_parser(action, help=words, description=words.capitalize() + ".", formatter_class=raw)
+        parser.epilog = station.examples_of(parser.prog, _EPILOG)
         station.add_options(parser)
         parser.set_defaults(run=run, config=None)
         if action != "reload":

@@ -80,6 +80,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--json", action="store_true", help="for a program to read")
 
 
+def examples_of(prog: str, epilog: str) -> str:
+    """Those lines of the examples of a group of commands that are about one of them, as an epilog of its own."""
+    lines = [line for line in epilog.splitlines() if f"{line.strip()} ".startswith(f"{prog} ")]
+    return "\n".join(["examples:", *lines, ""]) if lines else ""
+
+
 @contextmanager
 def open_client(options: argparse.Namespace, *, on_told: Callable[[Told], None] | None = None) -> Iterator[Client]:
     """The session of a command with its vehicle. What this station may not ask is refused without asking.

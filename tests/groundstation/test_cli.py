@@ -188,7 +188,7 @@ def test_replay_passes_everything_on(monkeypatch: pytest.MonkeyPatch, elsewhere:
     assert calls == [["replay", f"{elsewhere}/log.mcap", "--from=12.5", "--partial"]]
 
 
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["sim", "--seed", "x"], ["sim", "extra"], ["replay"]])
+@pytest.mark.parametrize("arguments", [[], ["sim", "--seed", "x"], ["sim", "extra"], ["replay"]])
 def test_wrong_commands(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
         cli.main(arguments)
