@@ -23,22 +23,20 @@ from typing import Final, Self, TypeVar
 import zenoh
 from msgspec import Struct
 
-from onboard.endpoints import LinkError, NoVehicleError, ZenohConfig, open_session
+from groundstation.asking import AGAIN, ASK_AFTER, PEER_LEASE, SOON, keys_of, send
+from onboard.endpoints import NoVehicleError, ZenohConfig, open_session
 from onboard.wire import (
     Ack,
     Ask,
-    Keys,
     Order,
     Outcome,
     StationPulse,
     Telemetry,
     Told,
     VehiclePulse,
-    Way,
     WireError,
     encode,
     read_ack,
-    read_refusal,
     read_telemetry,
     read_told,
     read_vehicle_pulse,
@@ -47,23 +45,10 @@ from onboard.wire import (
 
 T = TypeVar("T")
 
-#: An order without an answer is sent again after this time, s; the same, so it is not carried out twice.
-_AGAIN: Final = 0.25
-#: One that nobody took, since the vehicle was not there or takes no more in so short a time, after this time, s.
-_SOON: Final = 0.03
-#: One that was accepted is asked after this often, s, should the word of its end have been lost.
-_ASK_AFTER: Final = 1.0
 _PULSE_PERIOD: Final = 0.1
-#: Without a sign of the other machine, then it is gone, s.
-_PEER_LEASE: Final = 2.0
 #: Round trips of which the shortest is told: the newest.
 _ROUND_TRIPS: Final = 20
 _KEPT_EVENTS: Final = 1000
-_PRIORITY: Final = {
-    Way.SAFETY: zenoh.Priority.REAL_TIME,
-    Way.COMMAND: zenoh.Priority.INTERACTIVE_HIGH,
-    Way.VIEW: zenoh.Priority.INTERACTIVE_LOW,
-}
 
 
 class NoAnswerError(Exception):
@@ -126,7 +111,7 @@ class Client:
         self.station = settings.station or default_name()
         self.session = uuid.uuid4().hex[:12]
         """Name of this session among those of the station."""
-        self._keys = _keys(settings.vehicle, self.station)
+        self._keys = keys_of(settings.vehicle, self.station)
         self._changed = Condition()
         self._present = False
         self._pulse: VehiclePulse | None = None
@@ -200,20 +185,22 @@ class Client:
         identity = uuid.uuid4().hex
         if self._forbids is not None and (why := self._forbids(ask)):
             return Ack(identity, Outcome.REFUSED, why)
+        key = self._keys.station(self.station, self.session, way_of(ask))
         answers: SimpleQueue[Ack | None] = SimpleQueue()
         self._orders[identity] = answers
         end, due, accepted = time.monotonic() + timeout, 0.0, False
         try:
             while (now := time.monotonic()) < end:
                 if now >= due:
-                    due = now + (_ASK_AFTER if accepted else _AGAIN)
-                    self._send(Order(identity, ask, self._pulse.sent_ns if self._pulse else 0), answers, end - now)
+                    due = now + (ASK_AFTER if accepted else AGAIN)
+                    order = Order(identity, ask, self._pulse.sent_ns if self._pulse else 0)
+                    send(self._session, key, order, answers.put, end - now)
                 try:
                     answer = answers.get(timeout=max(0.0, min(due, end) - time.monotonic()))
                 except Empty:
                     continue
                 if answer is None:
-                    due = min(due, time.monotonic() + _SOON)
+                    due = min(due, time.monotonic() + SOON)
                 elif not (settled and answer.outcome is Outcome.ACCEPTED):
                     return answer
                 else:
@@ -225,35 +212,6 @@ class Client:
         what = "it was accepted, but is not done" if accepted else "no answer"
         raise NoAnswerError(f"{self._settings.vehicle}: {what} within {timeout:g} s")
 
-    def _send(self, order: Order, answers: SimpleQueue[Ack | None], timeout: float) -> None:
-        heard = False
-
-        def hear(reply: zenoh.Reply) -> None:
-            nonlocal heard
-            heard = True
-            if reply.ok is not None:
-                try:
-                    answers.put(read_ack(reply.ok.payload.to_bytes()))
-                except WireError as error:
-                    answers.put(Ack(order.id, Outcome.REFUSED, str(error)))
-            elif reply.err is not None and (why := read_refusal(reply.err.payload.to_bytes())):
-                answers.put(Ack(order.id, Outcome.REFUSED, why))
-
-        def end() -> None:
-            if not heard:
-                answers.put(None)
-
-        way = way_of(order.ask)
-        self._session.get(
-            self._keys.station(self.station, self.session, way),
-            zenoh.handlers.Callback(hear, end),
-            payload=encode(order),
-            timeout=timeout,
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=_PRIORITY[way],
-            express=True,
-        )
-
     # --- the session --------------------------------------------------------------------------------------------------
 
     def _open(self, timeout: float, security: ZenohConfig) -> zenoh.Session:
@@ -262,7 +220,7 @@ class Client:
             "client",
             settings.connect,
             plain=settings.plain,
-            lease=_PEER_LEASE,
+            lease=PEER_LEASE,
             security=security,
             timeout=timeout,
         )
@@ -349,15 +307,6 @@ class Client:
         if there:
             return f"no vehicle {vehicle!r} at {where}; there: {', '.join(there)}"
         return f"no vehicle is seen at {where}: is the link of {vehicle} on, and is {self.station} admitted?"
-
-
-def _keys(vehicle: str, station: str) -> Keys:
-    try:
-        keys = Keys(vehicle)
-        keys.ack(station)
-    except WireError as error:
-        raise LinkError(str(error)) from None
-    return keys
 
 
 def _vehicles(session: zenoh.Session) -> list[str]:

@@ -26,6 +26,7 @@ class Relay:
         self._whole.set()
         self._closing = Event()
         self._pairs: dict[socket.socket, socket.socket] = {}
+        self._held: set[socket.socket] = set()
         self._thread = Thread(target=self._carry, name="relay", daemon=True)
 
     def __enter__(self) -> Self:
@@ -47,10 +48,22 @@ class Relay:
         """Let everything pass again, what has waited first."""
         self._whole.set()
 
+    def hold(self, count: int) -> None:
+        """Let nothing more pass on the ``count`` oldest connections, as when a packet is lost again and again."""
+        ends = list(self._pairs)[: 2 * count]
+        if len(ends) < 2 * count:
+            raise ValueError(f"there are {len(self._pairs) // 2} connections")
+        self._held.update(ends)
+
+    @property
+    def connections(self) -> int:
+        """How many there are."""
+        return len(self._pairs) // 2
+
     def _carry(self) -> None:
         while not self._closing.is_set():
             self._whole.wait()
-            ready, _, _ = select.select([self._listener, *self._pairs], [], [], 0.005)
+            ready, _, _ = select.select([self._listener, *(self._pairs.keys() - self._held)], [], [], 0.005)
             if not self._whole.is_set():
                 continue
             for end in ready:

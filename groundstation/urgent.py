@@ -1,0 +1,187 @@
+"""Stop, retreat and kill over several connections at once.
+
+On a bad network a TCP connection stands still for a second and more whenever a packet is lost twice, and all that was
+sent after it waits. So the same order goes over several connections, which carry nothing else, and the vehicle, which
+knows its id, carries out the copy that comes first. Measured in docs/benchmarks.md.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+from threading import Condition, Thread
+from types import TracebackType
+from typing import Final, Self
+
+import zenoh
+from msgspec import Struct
+
+from groundstation.asking import AGAIN, PEER_LEASE, SOON, keys_of, send
+from groundstation.client import NoAnswerError, StationSettings, default_name
+from onboard.endpoints import LinkError, NoVehicleError, ZenohConfig, open_session
+from onboard.wire import Ack, Ask, Order, Outcome, Way, way_of
+
+#: More of them gain little and want more of the network.
+CONNECTIONS: Final = 3
+#: One attempt to connect; a handshake with TLS may need that long where packets are lost, s.
+_ATTEMPT: Final = 5.0
+_REST: Final = 0.2
+
+
+class _Pending(Struct):
+    order: Order
+    answers: SimpleQueue[Ack]
+    end: float
+
+
+class Urgent:
+    """Connections to one vehicle that are kept for what is urgent. Use as a context manager, or close it.
+
+    It needs no ``Client`` beside it and does not wait for the vehicle: an order leaves over each connection as soon as
+    that is there. Raises LinkError for a name that cannot be.
+    """
+
+    def __init__(
+        self, settings: StationSettings, *, security: ZenohConfig | None = None, connections: int = CONNECTIONS
+    ) -> None:
+        self._settings, self._security = settings, security or {}
+        station = settings.station or default_name()
+        self._key = keys_of(settings.vehicle, station).station(station, uuid.uuid4().hex[:12], Way.SAFETY)
+        self._changed = Condition()
+        self._orders: dict[str, _Pending] = {}
+        self._closing = False
+        self._open = 0
+        self._unreached: NoVehicleError | None = None
+        self._wrong: LinkError | None = None
+        self._lanes = [Thread(target=self._work, name=f"urgent.{i}", daemon=True) for i in range(connections)]
+        for lane in self._lanes:
+            lane.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave; an attempt to connect is waited for. Safe to call twice."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        for lane in self._lanes:
+            lane.join()
+
+    @property
+    def connections(self) -> int:
+        """Connections that were made; Zenoh mends one that has broken."""
+        return self._open
+
+    def ask(self, ask: Ask, *, timeout: float = 5.0, settled: bool = False) -> Ack:
+        """Ask the vehicle, and give the first answer; with ``settled``, what has become of it in the end.
+
+        Raises ValueError for what is not urgent, LinkError for settings that cannot be, NoVehicleError when no
+        connection could be made, NoAnswerError when there is no answer within ``timeout`` seconds.
+        """
+        if way_of(ask) is not Way.SAFETY:
+            raise ValueError(f"{ask} is not urgent: ask it with Client.ask")
+        order = Order(uuid.uuid4().hex, ask)
+        pending = _Pending(order, SimpleQueue(), time.monotonic() + timeout)
+        with self._changed:
+            self._orders[order.id] = pending
+            self._changed.notify_all()
+        accepted = False
+        try:
+            while self._wrong is None and (left := pending.end - time.monotonic()) > 0.0:
+                try:
+                    answer = pending.answers.get(timeout=min(left, _REST))
+                except Empty:
+                    continue
+                if not settled or answer.outcome is not Outcome.ACCEPTED:
+                    return answer
+                accepted = True
+        finally:
+            with self._changed:
+                del self._orders[order.id]
+        if self._wrong is not None:
+            raise self._wrong
+        if not self._open and self._unreached is not None:
+            raise self._unreached
+        what = "it was accepted, but is not done" if accepted else "no answer"
+        raise NoAnswerError(f"{self._settings.vehicle}: {what} within {timeout:g} s")
+
+    # --- one connection, in a thread of its own, so that one that blocks keeps no other -------------------------------
+
+    def _work(self) -> None:
+        session = self._connect()
+        if session is None:
+            return
+        self._count(1)
+        try:
+            self._serve(session)
+        finally:
+            self._count(-1)
+            session.close()
+
+    def _connect(self) -> zenoh.Session | None:
+        settings = self._settings
+        while not self._closing:
+            try:
+                return open_session(
+                    "client",
+                    settings.connect,
+                    plain=settings.plain,
+                    lease=PEER_LEASE,
+                    security=self._security,
+                    timeout=_ATTEMPT,
+                )
+            except NoVehicleError as error:
+                self._unreached = error
+            except LinkError as error:
+                self._wrong = error
+                return None
+        return None
+
+    def _serve(self, session: zenoh.Session) -> None:
+        """Send what is pending, again and again, until it is answered."""
+        due: dict[str, float] = {}
+
+        def soon(name: str) -> None:
+            with self._changed:
+                if name in due:
+                    due[name] = min(due[name], time.monotonic() + SOON)
+                    self._changed.notify_all()
+
+        while (pending := self._next(due)) is not None:
+            name, answers = pending.order.id, pending.answers
+
+            def answered(ack: Ack | None, name: str = name, answers: SimpleQueue[Ack] = answers) -> None:
+                if ack is None:
+                    soon(name)
+                else:
+                    answers.put(ack)
+
+            with suppress(zenoh.ZError):  # then it is sent again, here and elsewhere
+                send(session, self._key, pending.order, answered, max(pending.end - time.monotonic(), SOON))
+
+    def _next(self, due: dict[str, float]) -> _Pending | None:
+        """Wait for what is to be sent next, and note when to send it again; None: no more."""
+        with self._changed:
+            while not self._closing:
+                for name in due.keys() - self._orders.keys():
+                    del due[name]
+                now = time.monotonic()
+                for name, pending in self._orders.items():
+                    if due.get(name, now) <= now < pending.end:
+                        due[name] = now + AGAIN
+                        return pending
+                rest = min((at for at in due.values() if at > now), default=None)
+                self._changed.wait(None if rest is None else rest - now)
+        return None
+
+    def _count(self, more: int) -> None:
+        with self._changed:
+            self._open += more
