@@ -17,10 +17,20 @@ if TYPE_CHECKING:
     from groundstation.client import Client
 
 P = Phase
-#: What ``go`` leads to: the phases of the mission, without the safe ones beside it.
-GOALS: Final = tuple(
-    phase.value for phase in P if phase not in (*AT_REST, P.RETREAT_HOLD, P.RETREAT_LAND, P.TAKEOFF, P.LAND)
+#: The phases of the mission, in their order. Where ``go`` may lead at the moment, and where not, the vehicle says.
+_MISSION: Final = (
+    P.APPROACH,
+    P.ALIGN,
+    P.ADHESIVE,
+    P.TOOL_CHANGE,
+    P.TARE,
+    P.ADVANCE,
+    P.PRESS,
+    P.RELEASE,
+    P.RETREAT,
+    P.RETURN,
 )
+GOALS: Final = tuple(phase.value for phase in _MISSION)
 
 
 class _Order(NamedTuple):
@@ -74,7 +84,7 @@ _ORDERS: Final = {
         Mission(R.KILL),
     ),
     "reset": _Order("begin preflight anew, on the ground", "", Mission(R.RESET)),
-    "tare": _Order("take the force it feels away from contact for zero", "", Tare()),
+    "tare": _Order("while it hovers, take the force it feels for zero", "", Tare()),
 }
 
 
