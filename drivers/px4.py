@@ -396,16 +396,7 @@ class Px4:
 
         self._direct = MavlinkDirect(system)
         self._param = Param(system)
-        self._subscribe("ATTITUDE_QUATERNION", _AttitudeQuaternion, self._on_attitude)
-        self._subscribe("HIGHRES_IMU", _HighresImu, self._on_imu)
-        self._subscribe("LOCAL_POSITION_NED", _LocalPosition, self._on_motion)
-        self._subscribe("HEARTBEAT", _Heartbeat, self._on_heartbeat)
-        self._subscribe("EXTENDED_SYS_STATE", _ExtendedSysState, self._on_landed)
-        self._subscribe("BATTERY_STATUS", _BatteryStatus, self._on_battery)
-        self._subscribe("SYS_STATUS", _SysStatus, self._on_health)
-        self._subscribe("STATUSTEXT", _StatusText, self._on_text)
-        self._subscribe("TIMESYNC", _Timesync, self._on_timesync)
-        self._subscribe("PARAM_VALUE", _ParamValue, self._on_parameter)
+        self._subscribe_all()
         self._keep_texts_coming()
         await self._ask_intervals()
         await self._wait_for_samples()
@@ -765,6 +756,18 @@ class Px4:
 
     # -- what MAVSDK's thread calls -------------------------------------------------------------------------------
 
+    def _subscribe_all(self) -> None:
+        self._subscribe("ATTITUDE_QUATERNION", _AttitudeQuaternion, self._on_attitude)
+        self._subscribe("HIGHRES_IMU", _HighresImu, self._on_imu)
+        self._subscribe("LOCAL_POSITION_NED", _LocalPosition, self._on_motion)
+        self._subscribe("HEARTBEAT", _Heartbeat, self._on_heartbeat)
+        self._subscribe("EXTENDED_SYS_STATE", _ExtendedSysState, self._on_landed)
+        self._subscribe("BATTERY_STATUS", _BatteryStatus, self._on_battery)
+        self._subscribe("SYS_STATUS", _SysStatus, self._on_health)
+        self._subscribe("STATUSTEXT", _StatusText, self._on_text)
+        self._subscribe("TIMESYNC", _Timesync, self._on_timesync)
+        self._subscribe("PARAM_VALUE", _ParamValue, self._on_parameter)
+
     def _subscribe(self, name: str, fields: type[Any], take: Callable[[Any, int], None]) -> None:
         decode = msgspec.json.Decoder(fields).decode
         box = self._boxes.get(name)
@@ -776,7 +779,7 @@ class Px4:
             self._watch.heard(now)
             try:
                 take(decode(message.fields_json), now)
-            except (msgspec.DecodeError, ValueError):
+            except (ValueError, OverflowError, RecursionError):
                 # A number that is not finite arrives as null.
                 if box is not None:
                     box.reject()

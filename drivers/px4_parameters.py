@@ -58,7 +58,7 @@ def _wrong(columns: list[str]) -> Iterable[str]:
         yield f"{len(columns)} columns; {_ROW}"
         return
     vehicle, component, name, value, kind = columns
-    if not vehicle.isdecimal() or not 1 <= int(vehicle) <= 255:
+    if not (vehicle.isdecimal() and len(vehicle) <= 3 and 1 <= int(vehicle) <= 255):
         yield f"vehicle {vehicle!r}; want 1 to 255"
     if component != "1":
         yield f"component {component!r}; want 1, the autopilot"

@@ -10,8 +10,6 @@ from datetime import UTC, datetime
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
-
 from groundstation import codes, station
 from onboard.wire import ShowEvents, Told
 
@@ -68,8 +66,7 @@ class Printer:
 
     def history(self, client: Client) -> None:
         """Print what the vehicle remembers."""
-        shown = station.ask(client, ShowEvents(), self._options)
-        for told in msgspec.json.decode(shown.data, type=tuple[Told, ...]):
+        for told in station.shown(client, ShowEvents(), tuple[Told, ...], self._options):
             self._print(told, client.contact())
 
     def print_new(self, contact: Contact, timeout: float = 0.0) -> bool:

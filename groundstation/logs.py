@@ -17,8 +17,6 @@ from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-import msgspec
-
 from groundstation import codes, station
 from onboard.wire import ListLogs, LogFile, ReadLog
 
@@ -86,11 +84,7 @@ def run(options: argparse.Namespace) -> int:
 
 def listing(client: Client, options: argparse.Namespace) -> tuple[LogFile, ...]:
     """The logs of the vehicle, the newest first. Raises RefusedError, NoVehicleError, NoAnswerError."""
-    answer = station.ask(client, ListLogs(), options)
-    try:
-        return msgspec.json.decode(answer.data, type=tuple[LogFile, ...])
-    except msgspec.DecodeError as error:
-        raise station.RefusedError(f"the list of logs is not understood: {error}; update the vehicle") from None
+    return station.shown(client, ListLogs(), tuple[LogFile, ...], options)
 
 
 def _line(file: LogFile) -> str:

@@ -92,7 +92,7 @@ def former_wall_s(path: Path) -> float | None:
 
     try:
         return msgspec.json.decode(path.read_bytes(), type=Former).wall_s
-    except (OSError, msgspec.DecodeError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 

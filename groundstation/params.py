@@ -178,7 +178,7 @@ class VehicleParameters:
         from onboard.param_file import ConfigError, ParameterText
 
         vehicle = self._client.vehicle
-        text = station.ask(self._client, ShowParams(), self._options).data.decode()
+        text = station.ask(self._client, ShowParams(), self._options).data.decode(errors="replace")
         try:
             return ParameterText(text, vehicle)
         except ConfigError as error:

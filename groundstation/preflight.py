@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
-
 from groundstation import codes, station
 from onboard.wire import Check, ShowPreflight
 
@@ -85,11 +83,7 @@ def checklist(client: Client, options: argparse.Namespace) -> tuple[Check, ...]:
 
     Raises RefusedError, NoVehicleError, NoAnswerError.
     """
-    answer = station.ask(client, ShowPreflight(), options)
-    try:
-        told = msgspec.json.decode(answer.data, type=tuple[Check, ...])
-    except msgspec.DecodeError as error:
-        raise station.RefusedError(f"the checklist of the vehicle is not understood: {error}; update it") from None
+    told = station.shown(client, ShowPreflight(), tuple[Check, ...], options)
     return (*told, *seen(client.contact()))
 
 

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
@@ -30,6 +30,7 @@ _VEHICLE: Final = "pipewright"
 _PORT: Final = 7447
 _TIMEOUT: Final = 5.0
 
+T = TypeVar("T")
 Run = Callable[[argparse.Namespace], int]
 
 
@@ -163,6 +164,15 @@ def ask(client: Client, what: Ask, options: argparse.Namespace) -> Ack:
     if ack.outcome is Outcome.REFUSED:
         raise RefusedError(ack.text)
     return ack
+
+
+def shown(client: Client, what: Ask, kind: type[T], options: argparse.Namespace) -> T:
+    """Ask to be shown something that comes as JSON. Raises as ``ask``, and for what is not understood."""
+    data = ask(client, what, options).data
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (ValueError, RecursionError) as error:
+        raise RefusedError(f"what {client.vehicle} shows is not understood: {error}; update it") from None
 
 
 def command(client: Client, what: Ask, options: argparse.Namespace) -> Ack:

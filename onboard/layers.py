@@ -98,6 +98,8 @@ def show(value: Any) -> str:
 
 #: Longer than any line.
 _ENDLESS = 1_000_000
+#: A file that is larger (bytes), or stands for more values once its aliases are followed, is no configuration.
+LARGEST, MOST = 256 * 1024, 20_000
 _TAG = "tag:yaml.org,2002:"
 _FLOAT = r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
 # The core schema of YAML 1.2: 1e-4 is a number, `off` is text, 010 is ten, 1:30 is no number.
@@ -134,7 +136,11 @@ def read_yaml(path: Path, source: str | None = None) -> Layer:
     """Read one YAML file. Raises ConfigError for a file that cannot be read or is not a mapping."""
     source = source or str(path)
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        with path.open("rb") as file:
+            data = file.read(LARGEST + 1)
+        if len(data) > LARGEST:
+            raise ConfigError([f"{source}: is larger than {LARGEST // 1024} kB; want a file of parameters"])
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError([f"{source}: not UTF-8 text (byte {error.start})"]) from error
     except (OSError, ValueError) as error:
@@ -168,10 +174,10 @@ def parse_set(text: str) -> Layer:
 
 
 def _parse(text: str, source: str, lines: dict[Key, int]) -> Any:
-    errors: list[str] = []
+    builder = _Builder(source, lines)
     try:
         root = yaml.compose(text, Loader=_Loader)
-        value = None if root is None else _build(root, (), lines, errors, source, ())
+        value = None if root is None else builder.build(root, (), ())
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         raise ConfigError([f"{source}:{line}: not valid YAML: the character U+{error.character:04X}"]) from error
@@ -183,51 +189,70 @@ def _parse(text: str, source: str, lines: dict[Key, int]) -> Any:
         raise ConfigError([f"{source}{at}: not valid YAML: {error.problem}{context}"]) from error
     except RecursionError as error:
         raise ConfigError([f"{source}: nested too deeply"]) from error
-    if errors:
-        raise ConfigError(errors)
+    except (ValueError, OverflowError) as error:  # PyYAML takes \UFFFFFFFF and %YAML 1.<5000 digits> for right
+        raise ConfigError([f"{source}: not valid YAML: a character or version that cannot be: {error}"]) from error
+    if builder.errors:
+        raise ConfigError(builder.errors)
     return value
 
 
-def _build(
-    node: yaml.Node, path: Key, lines: dict[Key, int], errors: list[str], source: str, open_nodes: tuple[int, ...]
-) -> Any:
-    """Turn a YAML node into plain values; note the line of each; refuse duplicate keys, cycles and foreign tags."""
-    line = node.start_mark.line + 1
-    lines.setdefault(path, line)
-    if id(node) in open_nodes:
-        errors.append(f"{source}:{line}: {dotted(path)}: contains itself")
-        return None
-    inside = (*open_nodes, id(node))
-    if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
+class _Builder:
+    """Turns YAML nodes into plain values; notes the line of each; refuses duplicate keys, cycles and foreign tags."""
+
+    def __init__(self, source: str, lines: dict[Key, int]) -> None:
+        self._source, self._lines = source, lines
+        self._left = MOST
+        self.errors: list[str] = []
+
+    def build(self, node: yaml.Node, path: Key, open_nodes: tuple[int, ...]) -> Any:
+        line = node.start_mark.line + 1
+        self._lines.setdefault(path, line)
+        self._left -= 1
+        if self._left < 0:
+            raise ConfigError([f"{self._source}:{line}: {dotted(path)}: more than {MOST} values (each alias counts)"])
+        if id(node) in open_nodes:
+            return self._fail(line, path, "contains itself")
+        inside = (*open_nodes, id(node))
+        if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
+            return self._mapping(node, path, inside)
+        if isinstance(node, yaml.SequenceNode) and node.tag == _TAG + "seq":
+            return [self.build(item, (*path, str(i)), inside) for i, item in enumerate(node.value)]
+        text = node.value if isinstance(node, yaml.ScalarNode) else ""
+        kind = node.tag.removeprefix(_TAG) if isinstance(node, yaml.ScalarNode) else ""
+        match kind if kind == "str" or re.fullmatch(_SCALARS.get(kind, "(?!)"), text) else "":
+            case "str":
+                return text if _is_text(text) else self._fail(line, path, f"{text!r:.40} holds half a character")
+            case "null":
+                return None
+            case "bool":
+                return text.lower() == "true"
+            case "int":
+                return _integer(text)
+            case "float":
+                return float(text.replace(".", "") if text.lower().lstrip("+-") in (".inf", ".nan") else text)
+        return self._fail(line, path, f"{text!r:.40} with the tag {node.tag} is not allowed")
+
+    def _mapping(self, node: yaml.MappingNode, path: Key, inside: tuple[int, ...]) -> dict[str, Any]:
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
-            key_line = key_node.start_mark.line + 1
-            if not isinstance(key_node, yaml.ScalarNode):
-                errors.append(f"{source}:{key_line}: {dotted(path)}: a key must be a name")
+            line = key_node.start_mark.line + 1
+            if not isinstance(key_node, yaml.ScalarNode) or not _is_text(key_node.value):
+                self._fail(line, path, "a key must be a name")
                 continue
             key = key_node.value
             if key in result:
-                errors.append(f"{source}:{key_line}: {dotted((*path, key))}: given twice")
-            lines[(*path, key)] = key_line
-            result[key] = _build(value_node, (*path, key), lines, errors, source, inside)
+                self._fail(line, (*path, key), "given twice")
+            self._lines[(*path, key)] = line
+            result[key] = self.build(value_node, (*path, key), inside)
         return result
-    if isinstance(node, yaml.SequenceNode) and node.tag == _TAG + "seq":
-        return [_build(item, (*path, str(i)), lines, errors, source, inside) for i, item in enumerate(node.value)]
-    text = node.value if isinstance(node, yaml.ScalarNode) else ""
-    kind = node.tag.removeprefix(_TAG) if isinstance(node, yaml.ScalarNode) else ""
-    match kind if kind == "str" or re.fullmatch(_SCALARS.get(kind, "(?!)"), text) else "":
-        case "str":
-            return text
-        case "null":
-            return None
-        case "bool":
-            return text.lower() == "true"
-        case "int":
-            return _integer(text)
-        case "float":
-            return float(text.replace(".", "") if text.lower().lstrip("+-") in (".inf", ".nan") else text)
-    errors.append(f"{source}:{line}: {dotted(path)}: {text!r:.40} with the tag {node.tag} is not allowed")
-    return None
+
+    def _fail(self, line: int, path: Key, what: str) -> Any:
+        self.errors.append(f"{self._source}:{line}: {dotted(path)}: {what}")
+
+
+def _is_text(text: str) -> bool:
+    """Whether it can be written: an escape may name half of a character (a surrogate)."""
+    return text.isascii() or not any("\ud800" <= character <= "\udfff" for character in text)
 
 
 def _integer(text: str) -> int | str:

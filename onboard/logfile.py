@@ -58,7 +58,7 @@ class LogReader:
             self.info = msgspec.convert(scan.metadata[INFO_NAME], RunInfo, strict=False)
         except msgspec.ValidationError as error:
             raise LogError(f"{self.path}: the description of the run cannot be read ({error})") from None
-        self.config_yaml = scan.attachments[CONFIG_NAME].decode()
+        self.config_yaml = scan.attachments[CONFIG_NAME].decode(errors="replace")
         """The configuration in force at the start, as text."""
         self.complete = scan.complete
         """The log was finished properly."""
@@ -114,9 +114,9 @@ class LogReader:
                 elif topic == NONFINITE:
                     note = words.decode(message.data)
                     pending[note.topic] = note
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             text = f"a record on {topic} does not fit this version, it was written by {self.info.version}"
-            cause = f"{text} ({error})" if isinstance(error, msgspec.DecodeError) else str(error)
+            cause = str(error) if type(error) is ValueError else f"{text} ({error})"
             raise LogError(f"{self.path}: {cause}") from None
 
     def one(self, topic: str, kind: type[T]) -> Iterator[T]:
@@ -147,7 +147,10 @@ def _restore(message: Message, values: Mapping[str, str], kind: Any) -> Any:
     for path, value in values.items():
         *parents, last = path.split("/")
         node = tree
-        for key in parents:
-            node = node[int(key) if isinstance(node, list) else key]
-        node[int(last) if isinstance(node, list) else last] = float(value)
+        try:
+            for key in parents:
+                node = node[int(key) if isinstance(node, list) else key]
+            node[int(last) if isinstance(node, list) else last] = float(value)
+        except (LookupError, TypeError, ValueError):
+            raise ValueError(f"{path} = {value} is no number of the record on {message.topic}") from None
     return msgspec.convert(tree, kind)

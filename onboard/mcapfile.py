@@ -11,6 +11,7 @@ import json
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from typing import Any, BinaryIO
 
@@ -18,6 +19,7 @@ import msgspec
 import zstandard
 from mcap import records
 from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -35,6 +37,20 @@ def _record(record: records.McapRecord) -> bytes:
     record.write(builder)
     data: bytes = builder.end()  # type: ignore[no-untyped-call]
     return data
+
+
+_DAMAGED = (
+    McapError, zstandard.ZstdError, struct.error, LookupError, UnicodeDecodeError, OverflowError, MemoryError
+)  # fmt: skip
+
+
+@contextmanager
+def _whole(what: str) -> Iterator[None]:
+    """What cannot be read within is told as a ValueError: lengths and numbers of a damaged file point anywhere."""
+    try:
+        yield
+    except _DAMAGED as error:
+        raise ValueError(f"{what} is damaged ({str(error) or type(error).__name__})") from error
 
 
 def flat_schema(kind: Any) -> dict[str, Any]:
@@ -266,7 +282,7 @@ class McapScan:
     Works on a file that was cut off anywhere: ``complete`` tells whether it was finished.
 
     Raises:
-        ValueError: not an MCAP file.
+        ValueError: not an MCAP file, or one that is damaged.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -294,7 +310,8 @@ class McapScan:
                 stream.seek(position)
                 self.complete = stream.read(len(MAGIC)) == MAGIC
                 return
-            self._note(opcode, body, length)
+            with _whole(f"the record at byte {body - _RECORD.size}"):
+                self._note(opcode, body, length)
 
     def _note(self, opcode: int, body: int, length: int) -> None:
         if opcode == Opcode.CHUNK:
@@ -320,31 +337,33 @@ class McapScan:
         Raises:
             ValueError: a chunk is damaged or compressed in a way that is not read here.
         """
-        decompressor = zstandard.ZstdDecompressor()
+        for body, length in self._chunks:
+            with _whole(f"the chunk at byte {body}"):
+                yield from self._walk(self._unpacked(body, length))
+
+    def _unpacked(self, body: int, length: int) -> bytes:
+        self._stream.seek(body)
+        chunk = records.Chunk.read(ReadDataStream(BytesIO(self._stream.read(length))))
+        data: bytes = chunk.data
+        if chunk.compression == "zstd":
+            data = zstandard.ZstdDecompressor().decompress(data, chunk.uncompressed_size)
+        elif chunk.compression:
+            raise ValueError(f"compression {chunk.compression!r} is not supported, only zstd")
+        if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+            raise ValueError(f"the chunk at byte {body} is damaged (checksum)")
+        return data
+
+    def _walk(self, data: bytes) -> Iterator[Message]:
         topics = self._topics
         unpack = _MESSAGE.unpack_from
-        for body, length in self._chunks:
-            self._stream.seek(body)
-            chunk = records.Chunk.read(ReadDataStream(BytesIO(self._stream.read(length))))
-            if chunk.compression == "zstd":
-                try:
-                    data = decompressor.decompress(chunk.data, chunk.uncompressed_size)
-                except zstandard.ZstdError as error:
-                    raise ValueError(f"the chunk at byte {body} cannot be decompressed ({error})") from error
-            elif chunk.compression == "":
-                data = chunk.data
+        view = memoryview(data)
+        position = 0
+        end = len(data)
+        while position < end:
+            if data[position] == Opcode.MESSAGE:
+                _, size, channel, sequence, t_ns, _ = unpack(data, position)
+                stop = position + _RECORD.size + size
+                yield Message(topics[channel], sequence, t_ns, view[position + _MESSAGE.size : stop])
+                position = stop
             else:
-                raise ValueError(f"compression {chunk.compression!r} is not supported, only zstd")
-            if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-                raise ValueError(f"the chunk at byte {body} is damaged (checksum)")
-            view = memoryview(data)
-            position = 0
-            end = len(data)
-            while position < end:
-                if data[position] == Opcode.MESSAGE:
-                    _, size, channel, sequence, t_ns, _ = unpack(data, position)
-                    stop = position + _RECORD.size + size
-                    yield Message(topics[channel], sequence, t_ns, view[position + _MESSAGE.size : stop])
-                    position = stop
-                else:
-                    position += _RECORD.size + _RECORD.unpack_from(data, position)[1]
+                position += _RECORD.size + _RECORD.unpack_from(data, position)[1]

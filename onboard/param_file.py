@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from msgspec.structs import replace
+from yaml import YAMLError
 
 from onboard.config import CONFIGS, Config, law_names, load_config, scenario_names
 from onboard.declared import describe, to_mapping
@@ -151,7 +152,11 @@ def save(path: Path, wanted: Config, directory: Path = CONFIGS) -> tuple[Change,
             first = [change for change in changes if change.path in _CHOOSE] or changes
             held = parse_yaml(candidate.text, str(path)).values
             places = dict.fromkeys(_place(held, values, change) for change in first)
-            candidate.write(edited(candidate.text, ((place, _at(values, place)) for place in places)))
+            try:
+                candidate.write(edited(candidate.text, [(place, _at(values, place)) for place in places]))
+            except (LookupError, ValueError, YAMLError) as error:
+                layout = "is laid out in a way that no value can be put into: lay it out plainly; nothing was written"
+                raise ConfigError([f"{path}: {layout}"]) from error
             now = load_config(str(candidate.path), directory=directory)
             changes = diff(replace(now, scenario=before.scenario), wanted)
         if changes:

@@ -71,5 +71,5 @@ def load_roster(path: Path) -> Roster:
         raise RosterError(
             f"{path}: {error.strerror}; `pipewright keys` writes it into the authority's folder"
         ) from None
-    except msgspec.DecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise RosterError(f"{path}: {error}; copy it again from the folder of the authority") from None

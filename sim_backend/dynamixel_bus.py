@@ -15,6 +15,9 @@ from sim_backend.faults import Fault
 
 _READS = (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ, Instruction.BULK_READ, Instruction.FAST_BULK_READ)
 
+#: What the length field of a packet can say.
+_LONGEST = 0xFFFF
+
 
 class DynamixelBus:
     """The servos on one wire, the first of them named as in ``SERVO_NAMES``, and what goes wrong on it."""
@@ -139,6 +142,8 @@ class DynamixelBus:
         if fast and asked:
             # One status packet that the servos build together; nothing in it is stuffed.
             length = 1 + sum(size + 4 for _, _, size in asked)
+            if length > _LONGEST:
+                return b""
             reply = b"\xff\xff\xfd\x00" + bytes((BROADCAST,)) + length.to_bytes(2, "little") + bytes((STATUS,))
         for name, address, size in asked:
             servo = awake.get(name)

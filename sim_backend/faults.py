@@ -181,12 +181,23 @@ class Faults:
         return None
 
 
+class _Loader(yaml.SafeLoader):
+    """Merges nothing: a few lines of ``<<`` would stand for more than fits into memory."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Leave it as it is; ``<<`` is then a key that no fault has."""
+
+
+#: What PyYAML raises for text that is none; all but the first for what it takes for right, such as ``!!bool x``.
+_NOT_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError)
+
+
 def read_faults(text: str, source: str) -> tuple[Fault, ...]:
     """Faults from YAML: one mapping, or a list of them. Raises ValueError with every error; ``source`` is named."""
     try:
-        items = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(f"{source}: not YAML: {error}") from error
+        items = yaml.load(text, Loader=_Loader)
+    except _NOT_YAML as error:
+        raise ValueError(f"{source}: not YAML: {str(error) or type(error).__name__}") from error
     items = [] if items is None else items if isinstance(items, list) else [items]
     faults, errors = [], []
     for number, item in enumerate(items, 1):
@@ -203,8 +214,9 @@ def read_fault_file(path: Path) -> tuple[Fault, ...]:
     """Faults from a YAML file. Raises ValueError, also when there is no such file."""
     try:
         text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}; want a YAML list of faults") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ValueError(f"{path}: {reason}; want a YAML list of faults") from error
     return read_faults(text, str(path))
 
 

@@ -8,12 +8,10 @@ from contextlib import suppress
 from socket import AF_INET, SOCK_DGRAM, socket
 from threading import Event, Lock, Thread
 
-import msgspec
-
 from drivers.mailbox import Mailbox
 from drivers.protocols import DeviceError
 from drivers.samples import AutopilotCommand, AutopilotState, Engage, Odometry, ServoCommand, ServoState
-from sim_backend.world_messages import HELLO, LARGEST, Bye, Camera, Command, Hello, Look, encode, from_world
+from sim_backend.world_messages import FOREIGN, HELLO, LARGEST, Bye, Camera, Command, Hello, Look, encode, from_world
 
 #: How often the camera's stream is looked at, s.
 _GLANCE = 0.02
@@ -117,7 +115,7 @@ class WorldClient:
                     self._hello()
             try:
                 message = from_world(self._socket.recv(LARGEST))
-            except (TimeoutError, OSError, msgspec.DecodeError, msgspec.ValidationError):
+            except (OSError, *FOREIGN):
                 continue
             if isinstance(message, Look):
                 self._looks.put(message, message.t_ns)

@@ -13,7 +13,7 @@ from drivers.protocols import DeviceError
 from sim_backend.mock_devices import Clock, MockAutopilot, MockOdometry, MockServos
 from sim_backend.tracker import Tracker
 from sim_backend.world import World
-from sim_backend.world_messages import LARGEST, Address, Bye, Camera, Hello, Look, encode, to_world
+from sim_backend.world_messages import FOREIGN, LARGEST, Address, Bye, Camera, Hello, Look, encode, to_world
 
 #: Who has said nothing for so long is gone, s.
 PATIENCE = 2.0
@@ -83,7 +83,7 @@ class WorldServer:
                 continue
             try:
                 message = to_world(data)
-            except (msgspec.DecodeError, msgspec.ValidationError):
+            except FOREIGN:
                 continue  # not ours
             if isinstance(message, Hello):
                 self._peers[address] = (message, now)

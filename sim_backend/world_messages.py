@@ -84,6 +84,9 @@ class Command(Struct, frozen=True, tag=True, gc=False):
     servos: ServoCommand | None = None
 
 
+#: What the two below raise for a datagram that is none of these.
+FOREIGN = (ValueError, RecursionError)
+
 encode = msgspec.msgpack.Encoder().encode
 from_world = msgspec.msgpack.Decoder(Look | Camera).decode
 to_world = msgspec.msgpack.Decoder(Hello | Command | Bye).decode
