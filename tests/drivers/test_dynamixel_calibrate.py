@@ -7,6 +7,7 @@ from math import radians
 
 import pytest
 
+from drivers import dynamixel_calibrate as calibration
 from drivers import xc330
 from drivers.dynamixel_calibrate import FiveServos, calibrate, read_counts, with_signs, with_zeros
 from drivers.dynamixel_settings import DynamixelSettings, ServoSettings
@@ -72,11 +73,12 @@ def test_an_offset_in_the_servo_does_not_matter(emulator: DynamixelEmulator) -> 
 
 
 def test_signs_and_zeros_of_two_poses(emulator: DynamixelEmulator) -> None:
-    counts, angles = [], []
+    counts: list[calibration.Counts] = []
+    angles: list[Five] = []
     for pose in (FIRST, SECOND):
         stand(emulator, pose)
         counts.append(read_counts(settings(emulator, signed=False)))
-        angles.append(tuple(map(radians, pose)))
+        angles.append(tuple(map(radians, pose)))  # type: ignore[arg-type]
     found = with_zeros(with_signs(settings(emulator, signed=False).servos, counts, angles), counts[0], angles[0])
     assert [servo.sign for servo in found] == [mount.sign for mount in MOUNTING]
     assert [servo.zero for servo in found] == pytest.approx([mount.zero for mount in MOUNTING], abs=1)
