@@ -115,7 +115,12 @@ def test_floats_come_back_to_the_bit(values: list[float]) -> None:
 def test_what_is_absent_is_not_searched_for_what_is_not_finite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Looking through a whole tick costs more than recording it."""
     searched: list[object] = []
-    monkeypatch.setattr(recorder_module, "nonfinite", lambda message: searched.append(message) or {})
+
+    def search(message: object) -> dict[str, str]:
+        searched.append(message)
+        return {}
+
+    monkeypatch.setattr(recorder_module, "nonfinite", search)
     ticks = [CYCLES[2][0], replace(CYCLES[3][0], inputs=Inputs(3 * DT_NS, 0.004, None, None, None))]
     record(tmp_path / "log.mcap", [(tick, CYCLES[2][1]) for tick in ticks])
     assert searched == []
