@@ -1,22 +1,16 @@
 """Zeros and signs of the servos, from the arm stood in known poses by hand.
 
 Nothing is written to the servos and nothing moves: torque must be off, so that the arm can be stood as it should be.
-One pose gives the zeros; a second one, in which every servo stands elsewhere, gives the signs as well::
-
-    python -m drivers.dynamixel_calibrate --port /dev/servos --angles 0 0 0 0 0 --then 30 30 30 90 45
+One pose gives the zeros; a second one, in which every servo stands elsewhere, gives the signs as well.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import degrees, radians
 from statistics import median
 
-import msgspec
-import yaml
 from msgspec.structs import replace
 
 from drivers import xc330
@@ -34,6 +28,10 @@ _STILL = 10  # counts: more is no standing still
 _ATTEMPTS, _PATIENCE = 3, 0.05
 _LEAST = radians(5.0)  # less tells no sign
 _FAR = radians(10.0)  # so far from where it should have gone, a servo was not where it was said to be
+
+
+class PoseError(Exception):
+    """Two poses do not tell the signs; the text says of which servos."""
 
 
 def calibrate(settings: DynamixelSettings, angles: Five) -> FiveServos:
@@ -66,7 +64,7 @@ def with_zeros(servos: FiveServos, counts: Counts, angles: Five) -> FiveServos:
 def with_signs(servos: FiveServos, counts: Sequence[Counts], angles: Sequence[Five]) -> FiveServos:
     """These servos with the signs at which two poses' ``counts`` change as their ``angles`` (rad) do.
 
-    Raises DeviceError for a servo that was turned too little, or not by what was said.
+    Raises PoseError for servos that were turned too little, or not by what was said.
     """
     found, wrong = [], []
     for k, servo in enumerate(servos):
@@ -79,7 +77,7 @@ def with_signs(servos: FiveServos, counts: Sequence[Counts], angles: Sequence[Fi
             wrong.append(f"{SERVO_NAMES[k]}: turned by {degrees(turned):.0f} deg, but {degrees(said):.0f} were said")
         found.append(replace(servo, sign=1 if turned * said > 0.0 else -1))
     if wrong:
-        raise DeviceError(f"servo calibration: {'; '.join(wrong)}")
+        raise PoseError("; ".join(wrong))
     a, b, c, d, e = found
     return a, b, c, d, e
 
@@ -116,54 +114,3 @@ def _counts(bus: Bus, servo: Servo) -> int:
         )
     # The driver sets the homing offset to 0.
     return round(median(readings)) - bus.read(name, xc330.HOMING_OFFSET)
-
-
-# -- from the command line --------------------------------------------------------------------------------------------
-
-
-def to_yaml(servos: FiveServos) -> str:
-    """The servos as they are written in a configuration."""
-    plain = []
-    for servo in servos:
-        default = msgspec.to_builtins(ServoSettings(servo.id))
-        given = msgspec.to_builtins(servo)
-        plain.append({key: given[key] for key in given if key in ("id", "zero", "sign") or given[key] != default[key]})
-    lines = [yaml.safe_dump(each, default_flow_style=True, sort_keys=False, width=1000).strip() for each in plain]
-    return "devices:\n  servos:\n    servos:\n" + "".join(f"      - {line}\n" for line in lines)
-
-
-def _five(values: Sequence[float]) -> Five:
-    a, b, c, d, e = (radians(value) for value in values)
-    return a, b, c, d, e
-
-
-def main(arguments: Sequence[str] | None = None, wait: Callable[[str], object] = input) -> int:
-    """Read the servos as the arm stands, and print the zeros (and signs) for the configuration."""
-    parser = argparse.ArgumentParser(prog="python -m drivers.dynamixel_calibrate", description=main.__doc__)
-    names = tuple(name.upper() for name in SERVO_NAMES)
-    parser.add_argument("--port", required=True, help="serial port")
-    parser.add_argument("--baud", type=int, default=DynamixelSettings("").baud, choices=xc330.BAUDS, metavar="N")
-    parser.add_argument("--ids", type=int, nargs=5, default=(1, 2, 3, 4, 5), metavar=names, help="of the servos")
-    parser.add_argument("--signs", type=int, nargs=5, choices=(1, -1), default=(1,) * 5, metavar=names)
-    parser.add_argument("--angles", type=float, nargs=5, required=True, metavar=names, help="of the pose, deg")
-    parser.add_argument("--then", type=float, nargs=5, metavar=names, help="of a second pose, deg: find the signs too")
-    given = parser.parse_args(arguments)
-    try:
-        a, b, c, d, e = (
-            msgspec.convert({"id": name, "sign": sign}, ServoSettings)
-            for name, sign in zip(given.ids, given.signs, strict=True)
-        )
-        settings = DynamixelSettings(given.port, (a, b, c, d, e), given.baud)
-        angles, counts, servos = _five(given.angles), read_counts(settings), settings.servos
-        if given.then is not None:
-            wait("stand the arm in the second pose, then press return: ")
-            servos = with_signs(servos, (counts, read_counts(settings)), (angles, _five(given.then)))
-    except (DeviceError, msgspec.ValidationError) as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    sys.stdout.write(to_yaml(with_zeros(servos, counts, angles)))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

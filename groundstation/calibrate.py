@@ -1,224 +1,84 @@
-"""``pipewright calibrate hover RUN``: the thrust map of the vehicle that flew, from the hover in its log."""
+"""``pipewright calibrate hover|servos|mount``: find out what the vehicle is.
+
+Each kind has a module of its own, which is imported when it is asked for, so that --help answers at once.
+"""
 
 from __future__ import annotations
 
 import argparse
-import math
-import sys
-from collections.abc import Iterator
-from itertools import groupby
+from importlib import import_module
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
-import msgspec
-from msgspec import Struct
+from drivers.samples import SERVO_NAMES
+from drivers.xc330 import BAUDS
 
-from drivers.hover import HoverFit, HoverPoint, identify
-from drivers.thrust import ThrustMap
-from drivers.vehicle import Vehicle
-from onboard.messages import PARAMS, TICK, LogError, LogReader, Phase
+_NAMES = tuple(name.upper() for name in SERVO_NAMES)
+_HOVER_EPILOG = """\
+Have the vehicle hold in the air for a while, away from the pipe: 5 s at least, better two minutes, so that the voltage
+of the battery changes.
 
-Three = tuple[float, float, float]
+examples:
+  pipewright calibrate hover runs/jetson-001
+  pipewright calibrate hover runs/jetson-001 --config my-vehicle.yaml     writes it into the file
+"""
+_SERVOS_EPILOG = """\
+Torque must be off: stop the flight process. Nothing is written to the servos, and nothing moves. One pose gives the
+zeros; with a second one, in which every servo stands elsewhere, the signs are found too. Angles are in degrees; those
+of joints are as in docs/frames.md.
 
-#: A stretch of flight is hover when the vehicle is nowhere faster in it, m/s.
-STILL = 0.15
-#: Length of a stretch, s.
-STRETCH = 0.5
-#: Least hover that a calibration is taken from, s.
-LEAST = 5.0
-#: The pipe may carry or pull in these.
-_NEAR_THE_PIPE = {Phase.ADVANCE, Phase.PRESS, Phase.RELEASE, Phase.RETREAT, Phase.RETREAT_HOLD, Phase.RETREAT_LAND}
-_FLOWN_BY = ("attitude", "body_rate")
+examples:
+  pipewright calibrate servos --config my-vehicle.yaml --angles 0 0 0 0 0 --then 30 30 30 90 45
+  pipewright calibrate servos --port /dev/servos --baud 4000000 --angles 0 0 0 0 0
+"""
+_MOUNT_EPILOG = """\
+Props off, the flight process in PREFLIGHT: take the vehicle in both hands where the camera sees much, and for half a
+minute turn it about each of its axes, back and forth, by 30 deg and more, quickly. Then end the process.
 
-
-# What is read of the recorded structs: the same names, only the fields that are used here.
-
-
-class _State(Struct, gc=False):
-    armed: bool
-    mode: str
-    landed: str
-    battery_voltage: float
-
-
-class _Inputs(Struct, gc=False):
-    t_ns: int
-    autopilot: _State | None
-
-
-class _Estimate(Struct, gc=False):
-    v_WB: Three
-    rpy: Three
-    payload: bool
-    in_contact: bool
-
-
-class _Command(Struct, gc=False):
-    engage: str
-    interface: str
-    thrust: float
-
-
-class _Outputs(Struct, gc=False):
-    phase: str
-    estimate: _Estimate
-    autopilot: _Command
-
-
-class _Tick(Struct, gc=False):
-    index: int
-    inputs: _Inputs
-    outputs: _Outputs
-
-
-class _Autopilot(Struct):
-    kind: str
-    thrust: ThrustMap | None = None
-
-
-class _Devices(Struct):
-    autopilot: _Autopilot
-
-
-class _Config(Struct):
-    vehicle: Vehicle
-    devices: _Devices
-
-
-class _Revision(Struct):
-    config: _Config
-
-
-class HoverError(Exception):
-    """A flight cannot be calibrated from; the text says why and what to fly."""
-
-
-class Flown(Struct, frozen=True):
-    """What the log of a flight tells of its hover."""
-
-    before: ThrustMap
-    """The map that the set-points were made with."""
-    points: tuple[HoverPoint, ...]
-    """One for each stretch of ``STRETCH`` s."""
+examples:
+  pipewright calibrate mount runs/jetson-002
+  pipewright calibrate mount runs/jetson-002 --config my-vehicle.yaml     writes it into the file
+"""
 
 
 def add_parser(commands: Any) -> None:
     """Add ``calibrate`` to the commands of an argparse parser."""
-    words = "find out what the vehicle is, from the log of a flight"
+    words = "find out what the vehicle is: thrust map, zeros of the servos, mount of the camera"
     calibrate = commands.add_parser("calibrate", help=words, description=words.capitalize() + ".")
-    kinds = calibrate.add_subparsers(required=True, metavar="WHAT")
-    words = "the thrust map, from hover; prints what to put into the configuration"
-    hover = kinds.add_parser("hover", help=words, description=words.capitalize() + ".")
-    hover.add_argument("log", type=Path, metavar="RUN", help="log.mcap of a run, or its run folder")
-    hover.add_argument("--partial", action="store_true", help="accept a log that was cut off")
-    hover.set_defaults(run=run)
+    kinds = calibrate.add_subparsers(required=True, dest="kind", metavar="WHAT")
+    hover = _add(kinds, "hover", "the thrust map, from the hover in the log of a flight", _HOVER_EPILOG)
+    words = "zeros and signs of the servos, from the arm stood in known poses by hand"
+    servos = _add(kinds, "servos", words, _SERVOS_EPILOG)
+    servos.add_argument("--angles", type=float, nargs=5, required=True, metavar=_NAMES, help="of the pose, deg")
+    servos.add_argument("--then", type=float, nargs=5, metavar=_NAMES, help="of a second pose, deg: find the signs too")
+    bus = servos.add_argument_group("the bus (default: as --config says)")
+    bus.add_argument("--port", help="serial port, like /dev/servos")
+    bus.add_argument("--baud", type=int, choices=BAUDS, metavar="N")
+    bus.add_argument("--ids", type=int, nargs=5, metavar=_NAMES, help="of the servos")
+    bus.add_argument("--signs", type=int, nargs=5, choices=(1, -1), metavar=_NAMES)
+    words = "where the camera sits and how it is turned, from the log of a motion"
+    mount = _add(kinds, "mount", words, _MOUNT_EPILOG)
+    for parser in (hover, mount):
+        parser.add_argument("log", type=Path, metavar="RUN", help="log.mcap of a run, or its run folder")
+        parser.add_argument("--partial", action="store_true", help="accept a log that was cut off")
+
+
+def _add(kinds: Any, name: str, words: str, epilog: str) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = kinds.add_parser(
+        name,
+        help=words,
+        description=words.capitalize() + ".",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    words = "file of the vehicle's configuration: what is found is written into it"
+    parser.add_argument("--config", metavar="FILE", help=words)
+    parser.set_defaults(run=run)
+    return parser
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run ``calibrate hover``; gives the exit code: 0, or 2 for a flight that cannot be used."""
-    log = options.log / "log.mcap" if options.log.is_dir() else options.log
-    try:
-        flown = read(log, partial=options.partial)
-        fit = identify(flown.points, flown.before)
-    except (LogError, HoverError) as error:
-        print(f"pipewright: {error}", file=sys.stderr)
-        return 2
-    for line in words_of(flown, fit):
-        print(f"# {line}")
-    print(configuration(fit.thrust), end="")
-    return 0
-
-
-def read(log: Path, *, partial: bool = False) -> Flown:
-    """The hover in a log.
-
-    Raises LogError for one that cannot be read, HoverError when it holds no hover to calibrate from.
-    """
-    config: _Config | None = None
-    ticks: list[_Tick] = []
-    with LogReader(log, partial=partial) as reader:
-        for topic, message in reader.read({TICK: _Tick, PARAMS: _Revision}):
-            if topic == TICK:
-                ticks.append(message)
-            elif config is None:
-                config = message.config
-    if config is None or not ticks:
-        raise HoverError(f"{log}: holds no cycle; the run ended before its first tick")
-    if config.devices.autopilot.kind == "mock":
-        raise HoverError(f"{log}: its autopilot was a mock, which takes newtons; fly a real or an emulated one")
-    if ticks[0].outputs.autopilot.interface not in _FLOWN_BY:
-        raise HoverError(f"{log}: was flown with wrenches; want set-points of attitude or body rate")
-    before = config.devices.autopilot.thrust or ThrustMap.of(config.vehicle)
-    points = tuple(_points(ticks, config.vehicle, before))
-    if len(points) * STRETCH < LEAST:
-        raise HoverError(
-            f"{log}: {len(points) * STRETCH:g} s of hover; at least {LEAST:g} s are needed, in the air, in offboard "
-            f"mode, away from the pipe and slower than {STILL:g} m/s: have the vehicle hold for a while (request hold)"
-        )
-    return Flown(before, points)
-
-
-def _points(ticks: list[_Tick], vehicle: Vehicle, thrust: ThrustMap) -> Iterator[HoverPoint]:
-    start = ticks[0].inputs.t_ns
-    for _, group in groupby(ticks, lambda tick: (tick.inputs.t_ns - start) // round(1e9 * STRETCH)):
-        stretch = list(group)
-        first, last = stretch[0], stretch[-1]
-        whole = last.index - first.index + 1 == len(stretch)
-        if whole and last.inputs.t_ns - first.inputs.t_ns > 0.9e9 * STRETCH and all(map(_hovers, stretch)):
-            yield _point(stretch, vehicle, thrust)
-
-
-def _hovers(tick: _Tick) -> bool:
-    state, estimate, command = tick.inputs.autopilot, tick.outputs.estimate, tick.outputs.autopilot
-    return (
-        state is not None
-        and state.armed
-        and state.mode == "offboard"
-        and state.landed == "in_air"
-        and state.battery_voltage > 0.0
-        and command.engage == "offboard"
-        and not estimate.in_contact
-        and tick.outputs.phase not in _NEAR_THE_PIPE
-        and math.hypot(*estimate.v_WB) < STILL
-    )
-
-
-def _point(stretch: list[_Tick], vehicle: Vehicle, thrust: ThrustMap) -> HoverPoint:
-    """Weight and mean acceleration against mean lift: what the rotors gave along +z of B."""
-    estimates = [tick.outputs.estimate for tick in stretch]
-    voltages = [tick.inputs.autopilot.battery_voltage for tick in stretch if tick.inputs.autopilot is not None]
-    mass = vehicle.base.mass + sum(part.mass for part in vehicle.arm.parts)
-    mass += vehicle.arm.sleeve.mass * fmean(estimate.payload for estimate in estimates)
-    lasted = (stretch[-1].inputs.t_ns - stretch[0].inputs.t_ns) * 1e-9
-    climb = (estimates[-1].v_WB[2] - estimates[0].v_WB[2]) / lasted
-    upright = fmean(math.cos(estimate.rpy[0]) * math.cos(estimate.rpy[1]) for estimate in estimates)
-    sent = (
-        thrust.set_point(tick.outputs.autopilot.thrust, volts) for tick, volts in zip(stretch, voltages, strict=True)
-    )
-    return HoverPoint(mass * (vehicle.gravity + climb) / upright, fmean(sent), fmean(voltages))
-
-
-def words_of(flown: Flown, fit: HoverFit) -> Iterator[str]:
-    """What was found, line by line, for a person."""
-    points, found = flown.points, fit.thrust
-    volts = [point.voltage for point in points]
-    middle = found.hover_voltage
-    was, now = flown.before.full_force(middle), found.full_force(middle)
-    yield f"{len(points) * STRETCH:g} s of hover at {min(volts):.2f} to {max(volts):.2f} V"
-    yield f"full thrust at {middle:.2f} V: {now:.2f} N, {100 * (now / was - 1):+.1f} % against the map in force"
-    yield f"hover at set-point {found.hover_thrust:.4f} for {found.hover_force:.2f} N"
-    if fit.slope_taken:
-        yield f"thrust goes with voltage to the power of {found.voltage_exponent:.2f} (+- {fit.slope_error:.2f})"
-    else:
-        yield f"the voltage changed too little to tell its exponent; {found.voltage_exponent:g} is kept"
-    left_out = f"; {fit.left_out} of {len(points)} stretches were far off and left out" if fit.left_out else ""
-    yield f"the hover lies within {100 * fit.spread:.2f} % (rms) of the new map{left_out}"
-    yield "put this into the configuration:"
-
-
-def configuration(thrust: ThrustMap) -> str:
-    """The map as YAML for a configuration file."""
-    values = msgspec.to_builtins(thrust)
-    lines = [f"      {name}: {value:.5g}" for name, value in values.items()]
-    return "\n".join(["devices:", "  autopilot:", "    thrust:", *lines]) + "\n"
+    """Run one calibration; gives the exit code."""
+    guarded = import_module("groundstation.calibration").guarded
+    code: int = guarded(import_module(f"groundstation.calibrate_{options.kind}").run)(options)
+    return code

@@ -17,6 +17,7 @@ from onboard.messages import Phase
 _MARGIN = 4.0
 #: Pictures of single late ticks show the largest value of each stretch of so many seconds.
 _STRETCH = 0.5
+_SERVOS = ("θ₁", "θ₂", "θ₃", "pump", "gripper")
 #: Kind of a phase, which chooses its colour.
 _KINDS = {
     Phase.PREFLIGHT: "ground",
@@ -187,6 +188,37 @@ def processor(run: Run) -> list[Chart]:
     for i, (name, (t, share)) in enumerate(values.items()):
         chart.line(t, 100.0 * share, name[len(punctuality.CPU) :], f"c{i % 6 + 1}")
     return [chart] if values else []
+
+
+def servos(run: Run) -> list[Chart]:
+    """Current and temperature of each servo."""
+    if not np.isfinite(run.health.temperature).any():
+        return []
+    current = Chart(f"largest current in each {_STRETCH:g} s", "A", whole(run))
+    temperature = Chart("temperature", "degC", whole(run))
+    for i, name in enumerate(_SERVOS):
+        current.line(*_largest(run.t, np.abs(run.health.current[:, i])), name, f"c{i + 1}")
+        temperature.line(*_largest(run.t, run.health.temperature[:, i]), name, f"c{i + 1}")
+    return [current, temperature]
+
+
+def vision(run: Run) -> list[Chart]:
+    """The tracker's own confidence, and how far its vertical is from the autopilot's."""
+    if not np.isfinite(run.health.confidence).any():
+        return []
+    confidence = Chart(f"least confidence in each {_STRETCH:g} s", "of 3", whole(run), y=(-0.1, 3.1))
+    t, lost = _largest(run.t, 3.0 - run.health.confidence)
+    lean = Chart("largest angle between the verticals of tracker and autopilot", "deg", whole(run))
+    lean.line(*_largest(run.t, np.degrees(run.health.lean)), "", "c1")
+    return [confidence.line(t, 3.0 - lost, "", "c2"), lean]
+
+
+def link(run: Run) -> list[Chart]:
+    """How long ago the commanding station was certainly there."""
+    if not np.isfinite(run.health.link_age).any():
+        return []
+    words = f"age of the newest word of the commanding station, largest in each {_STRETCH:g} s"
+    return [Chart(words, "s", whole(run), width=950, height=180).line(*_largest(run.t, run.health.link_age), "", "c1")]
 
 
 def _decade_above(value: float) -> float:

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from groundstation import health
 from groundstation.punctuality import timing
 from groundstation.run import Array, Mask, Run
 from onboard.messages import Phase
@@ -75,6 +76,7 @@ def compute(run: Run, wall_s: float | None = None) -> dict[str, Any]:
         "limits": _limits(run),
         "adhesive": _adhesive(run),
         "timing": timing(run),
+        "health": health.compute(run),
         "paper": PAPER,
     }
 

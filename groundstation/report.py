@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from groundstation import figures, punctuality, table
+from groundstation import figures, health, punctuality, table
 from groundstation.run import Run
 from groundstation.svg import Chart
 from onboard.messages import Severity
@@ -51,6 +51,7 @@ def _page(run: Run, metrics: dict[str, Any], beside: Sequence[dict[str, Any]]) -
     yield from _figure("Actuation (figure 7)", note, figures.actuation(run), pair=False)
     note = "The drawing is to scale, with the vehicle to the left; the broken circle is the needle's path."
     yield from _figure("At the pipe", note, figures.at_the_pipe(run), pair=True)
+    yield from _health(run, metrics)
     yield from _timing(run, metrics)
     yield from _events(run)
     yield "<h2>Configuration</h2><details><summary>all that was in force at the start</summary>"
@@ -115,11 +116,44 @@ def _table(metrics: dict[str, Any], beside: Sequence[dict[str, Any]]) -> Iterato
 
 def _figure(heading: str, note: str, charts: list[Chart], *, pair: bool) -> Iterator[str]:
     if charts:
-        yield f'<h2>{escape(heading)}</h2><p class="note">{escape(note)}</p>'
+        yield f"<h2>{escape(heading)}</h2>" + (f'<p class="note">{escape(note)}</p>' if note else "")
         yield '<div class="pair">' if pair else "<div>"
         for chart in charts:
             yield f"<div{' class=drawing' if chart.equal else ''}>{chart.svg()}</div>"
         yield "</div>"
+
+
+def _health(run: Run, metrics: dict[str, Any]) -> Iterator[str]:
+    servos, vision, link = (metrics["health"][part] for part in ("servos", "vision", "link"))
+    if servos is not None:
+        yield from _figure("Servos", "", figures.servos(run), pair=True)
+        yield from _servo_table(servos)
+    if vision is not None:
+        shares = ", ".join(f"{level} for {100 * share:.1f} %" for level, share in vision["confidence"].items() if share)
+        jumps = f"its frame jumped {vision['jumps']} times" if vision["jumps"] else "its frame never jumped"
+        note = f"The tracker's confidence (of 3) was {shares} of the ticks; {jumps}."
+        yield from _figure("Vision", note, figures.vision(run), pair=True)
+    if link is not None:
+        age = link["age"]
+        note = (
+            f"Commanded by {', then '.join(link['commanders'])}. The newest word was at most {age['max']:.2f} s old "
+            f"(median {age['median']:.2f} s); older than {health.SILENT:g} s for {link['silent_s']:.1f} s in all, and "
+            f"nobody was connected for {link['absent_s']:.1f} s of it."
+        )
+        yield from _figure("Link", note, figures.link(run), pair=False)
+
+
+def _servo_table(servos: dict[str, dict[str, Any]]) -> Iterator[str]:
+    headings = ("largest current, A", "its RMS, A", "supply, V", "warmest, degC")
+    yield "<table><tr><th></th>" + "".join(f'<th class="n">{words}</th>' for words in headings) + "<th>errors</th></tr>"
+    for name, told in servos.items():
+        supply = f"{told['voltage_min']:.1f} to {told['voltage_max']:.1f}"
+        cells = (f"{told['current_max']:.2f}", f"{told['current_rms']:.2f}", supply, f"{told['temperature_max']:.0f}")
+        errors = f'<td class="bad">✗ {escape(told["errors"])}</td>' if told["errors"] else "<td>none</td>"
+        yield (
+            f"<tr><td>{escape(name)}</td>" + "".join(f'<td class="n">{cell}</td>' for cell in cells) + errors + "</tr>"
+        )
+    yield "</table>"
 
 
 def _timing(run: Run, metrics: dict[str, Any]) -> Iterator[str]:

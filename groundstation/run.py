@@ -31,25 +31,46 @@ from onboard.messages import (
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Three = tuple[float, float, float]
+Four = tuple[float, float, float, float]
+Five = tuple[float, float, float, float, float]
 
 
 # What is read of the recorded structs: the same names, only the fields that are used here.
 
 
-class _Stamped(Struct, gc=False):
+class _Odometry(Struct, gc=False):
     t_ns: int
+    q_WB: Four
+    confidence: int
+    reset_counter: int
 
 
 class _Autopilot(Struct, gc=False):
     t_ns: int
+    q_WB: Four
     landed: str
+
+
+class _Servos(Struct, gc=False):
+    t_ns: int
+    current: Five
+    voltage: Five
+    temperature: Five
+    error: Five
+
+
+class _Link(Struct, frozen=True, gc=False):
+    commander: str = ""
+    heard_ns: int = 0
+    present: bool = False
 
 
 class _Inputs(Struct, gc=False):
     t_ns: int
-    odometry: _Stamped | None
+    odometry: _Odometry | None
     autopilot: _Autopilot | None
-    servos: _Stamped | None
+    servos: _Servos | None
+    link: _Link = _Link()
 
 
 class _Estimate(Struct, gc=False):
@@ -94,10 +115,10 @@ class _Tick(Struct, gc=False):
 
 class _Truth(Struct, gc=False):
     p_WB: Three
-    q_WB: tuple[float, float, float, float]
+    q_WB: Four
     joints: Three
     joint_torque: Three
-    rotor_thrust: tuple[float, float, float, float]
+    rotor_thrust: Four
     tip_W: Three
     needle_W: Three
     contact_force: float
@@ -172,6 +193,29 @@ class Truths:
 
 
 @dataclass(frozen=True)
+class Health:
+    """How servos, tracker and link did at each tick: n rows, NaN where they told nothing."""
+
+    current: Array
+    voltage: Array
+    temperature: Array
+    error: Array
+    """Of the servos, (n, 5): A, V, degC, hardware-error bits."""
+    confidence: Array
+    """Of the tracker, 0 to 3, (n,)."""
+    resets: Array
+    """Its frame's jumps so far, (n,)."""
+    lean: Array
+    """Between the verticals of tracker and autopilot, rad, (n,)."""
+    link_age: Array
+    """Time since the commanding station was certainly there, s, (n,); NaN while nobody commands."""
+    link_present: Mask
+    """It is connected, (n,)."""
+    commanders: tuple[str, ...]
+    """Names of the stations that have commanded, in order."""
+
+
+@dataclass(frozen=True)
 class Run:
     """Everything that metrics and report need. Arrays have n rows, one per tick; SI, W, angles in rad."""
 
@@ -211,6 +255,7 @@ class Run:
     sent: Array
     """Start of the tick against its schedule, its duration, and its part until the set-point had left, s; NaN where
     nothing was recorded, as in every simulated run."""
+    health: Health
     devices: list[DeviceReport] = field(default_factory=list)
     """How the devices did, about once a second of a wall-clock run."""
     events: list[Event] = field(default_factory=list)
@@ -223,6 +268,7 @@ class Run:
 
 
 SOURCES = ("odometry", "autopilot", "servos")
+_NO_SERVOS, _NO_POSE, _NO_ATTITUDE = ((float("nan"),) * count for count in (10, 6, 4))
 #: An older truth says nothing of a tick, s.
 TRUTH_LASTS = 0.05
 
@@ -243,6 +289,7 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
     events: list[Event] = []
     timings: list[Timing] = []
     devices: list[DeviceReport] = []
+    commanders: list[str] = []
     config: RunConfig | None = None
     start_ns = 0
     nowhere = float("nan")
@@ -283,7 +330,15 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
                     estimate.age_autopilot,
                     estimate.age_servos,
                     outputs.autopilot.engage == "offboard",
+                    *(_NO_SERVOS if servos is None else (*servos.current, *servos.voltage)),
+                    *(_NO_SERVOS if servos is None else (*servos.temperature, *servos.error)),
+                    *(_NO_POSE if odometry is None else (odometry.confidence, odometry.reset_counter, *odometry.q_WB)),
+                    *(_NO_ATTITUDE if autopilot is None else autopilot.q_WB),
+                    (inputs.t_ns - inputs.link.heard_ns) * 1e-9 if inputs.link.commander else nowhere,
+                    inputs.link.present,
                 )
+                if (name := inputs.link.commander) and name not in commanders[-1:]:
+                    commanders.append(name)
                 if autopilot is not None:
                     landed = autopilot.landed
             elif topic == TRUTH:
@@ -344,6 +399,18 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
             late=punctuality[:, 0],
             busy=punctuality[:, 1],
             sent=punctuality[:, 2],
+            health=Health(
+                current=rows[:, 31:36],
+                voltage=rows[:, 36:41],
+                temperature=rows[:, 41:46],
+                error=rows[:, 46:51],
+                confidence=rows[:, 51],
+                resets=rows[:, 52],
+                lean=_lean(rows[:, 53:57], rows[:, 57:61]),
+                link_age=rows[:, 61],
+                link_present=rows[:, 62] > 0,
+                commanders=tuple(commanders),
+            ),
             devices=devices,
             events=sorted(events, key=lambda event: event.t_ns),
             start_ns=start_ns,
@@ -388,6 +455,15 @@ def _truths(values: list[float], times: Array, t: Array, last: _Truth, crashed: 
         on_ground=last.on_ground,
         crashed=crashed,
     )
+
+
+def _lean(one: Array, other: Array) -> Array:
+    """Angle (rad) between the verticals of two series of quaternions, (n, 4) each."""
+    a, b = (
+        np.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))) for w, x, y, z in (one.T, other.T)
+    )
+    angle: Array = np.arctan2(np.linalg.norm(np.cross(a, b, axis=0), axis=0), np.sum(a * b, axis=0))
+    return angle
 
 
 def euler(q: Array) -> Array:

@@ -231,9 +231,8 @@ class Recorder:
         if writer.pending and (t_ns - writer.pending_since_ns >= _CHUNK_NS or writer.pending > _CHUNK_BYTES):
             writer.flush()
         inputs = tick.inputs
-        absent = (
-            (inputs.odometry is None) + (inputs.autopilot is None) + (inputs.servos is None) + (inputs.request is None)
-        )
+        optional = (inputs.odometry, inputs.autopilot, inputs.servos, inputs.request, inputs.go)
+        absent = sum(value is None for value in optional)
         self._add(self._ticks, t_ns, tick, absent)
         if truth is not None:
             self._add(self._truths, t_ns, truth, 0)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from math import radians
 
-import msgspec
 import pytest
-import yaml
 
 from drivers import dynamixel_calibrate as calibration
 from drivers import xc330
-from drivers.dynamixel_calibrate import FiveServos, calibrate, read_counts
+from drivers.dynamixel_calibrate import FiveServos, calibrate, read_counts, with_signs, with_zeros
 from drivers.dynamixel_settings import DynamixelSettings, ServoSettings
 from drivers.protocols import DeviceError
 from drivers.samples import Five
@@ -26,7 +24,6 @@ MOUNTING: FiveServos = (
     ServoSettings(id=9, zero=100, sign=-1),
     ServoSettings(id=12, zero=3000),
 )
-IDS = ["--ids", "3", "7", "4", "9", "12"]
 FIRST: Five = (10.0, -20.0, 0.0, 90.0, 5.0)
 SECOND: Five = (40.0, 20.0, -30.0, -45.0, -40.0)
 
@@ -75,24 +72,16 @@ def test_an_offset_in_the_servo_does_not_matter(emulator: DynamixelEmulator) -> 
     assert read_counts(settings(emulator)) == before
 
 
-def test_signs_and_zeros_from_the_command_line(emulator: DynamixelEmulator, capsys: pytest.CaptureFixture[str]) -> None:
-    stand(emulator, FIRST)
-    arguments = ["--port", emulator.path, *IDS, "--angles", *map(str, FIRST), "--then", *map(str, SECOND)]
-    assert calibration.main(arguments, lambda text: stand(emulator, SECOND)) == 0
-    told = yaml.safe_load(capsys.readouterr().out)["devices"]["servos"]["servos"]
-    found = msgspec.convert(told, FiveServos)
-    assert [servo.id for servo in found] == [mount.id for mount in MOUNTING]
+def test_signs_and_zeros_of_two_poses(emulator: DynamixelEmulator) -> None:
+    counts: list[calibration.Counts] = []
+    angles: list[Five] = []
+    for pose in (FIRST, SECOND):
+        stand(emulator, pose)
+        counts.append(read_counts(settings(emulator, signed=False)))
+        angles.append(tuple(map(radians, pose)))  # type: ignore[arg-type]
+    found = with_zeros(with_signs(settings(emulator, signed=False).servos, counts, angles), counts[0], angles[0])
     assert [servo.sign for servo in found] == [mount.sign for mount in MOUNTING]
     assert [servo.zero for servo in found] == pytest.approx([mount.zero for mount in MOUNTING], abs=1)
-
-
-def test_a_servo_that_was_not_turned_as_said(emulator: DynamixelEmulator, capsys: pytest.CaptureFixture[str]) -> None:
-    stand(emulator, FIRST)
-    arguments = ["--port", emulator.path, *IDS, "--angles", *map(str, FIRST), "--then", "40", "-22", "-30", "-45", "45"]
-    assert calibration.main(arguments, lambda text: stand(emulator, (40.0, -22.0, -30.0, -45.0, 5.0))) == 1
-    told = capsys.readouterr().err
-    assert "theta_2: the poses are -2 deg apart, want 5 or more" in told
-    assert "gripper: turned by 0 deg, but 40 were said" in told
 
 
 def test_with_torque_on(emulator: DynamixelEmulator) -> None:
@@ -125,8 +114,3 @@ def test_one_that_is_missing(emulator: DynamixelEmulator) -> None:
     emulator.inject(Kind.SILENT, part="pump")
     with pytest.raises(DeviceError, match=r"no answer from pump \(id 9\)"):
         read_counts(settings(emulator))
-
-
-def test_no_port(capsys: pytest.CaptureFixture[str]) -> None:
-    assert calibration.main(["--port", "/nowhere", "--angles", "0", "0", "0", "0", "0"]) == 1
-    assert "cannot open /nowhere: it is not there" in capsys.readouterr().err

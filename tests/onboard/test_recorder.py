@@ -17,13 +17,14 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from msgspec.structs import replace
 
-from onboard.core.types import Event, Severity, Tick
+from onboard import recorder as recorder_module
+from onboard.core.types import Event, Inputs, Severity, Tick
 from onboard.logfile import LogReader
 from onboard.mcapfile import McapScan, McapWriter, flat_schema
 from onboard.recorder import Recorder
 from onboard.records import EVENT, KEYFRAME, PARAMS, TICK, TRUTH, Keyframe, RunInfo, Timing
 from sim_backend.plant import Truth
-from tests.synthetic import ConfigStub, change_outputs, mission, record
+from tests.synthetic import DT_NS, ConfigStub, change_outputs, mission, record
 
 
 class StateStub(msgspec.Struct, frozen=True):
@@ -109,6 +110,20 @@ def test_floats_come_back_to_the_bit(values: list[float]) -> None:
         assert [math.copysign(1, v) for v in msgspec.json.decode(message.data)["contact_W"]] == [
             math.copysign(1, v) for v in values
         ]
+
+
+def test_what_is_absent_is_not_searched_for_what_is_not_finite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looking through a whole tick costs more than recording it."""
+    searched: list[object] = []
+
+    def search(message: object) -> dict[str, str]:
+        searched.append(message)
+        return {}
+
+    monkeypatch.setattr(recorder_module, "nonfinite", search)
+    ticks = [CYCLES[2][0], replace(CYCLES[3][0], inputs=Inputs(3 * DT_NS, 0.004, None, None, None))]
+    record(tmp_path / "log.mcap", [(tick, CYCLES[2][1]) for tick in ticks])
+    assert searched == []
 
 
 def test_values_that_json_cannot_say_come_back(tmp_path: Path) -> None:

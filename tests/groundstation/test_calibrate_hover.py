@@ -14,7 +14,8 @@ from msgspec.structs import replace
 from drivers.samples import AutopilotCommand, AutopilotState, FlightMode, Interface
 from drivers.thrust import ThrustMap
 from groundstation import calibrate
-from groundstation.calibrate import HoverError, read
+from groundstation.calibrate_hover import read
+from groundstation.calibration import CalibrationError
 from onboard.config import Config, load_config
 from onboard.core.types import Phase, Tick
 from onboard.messages import LogError
@@ -72,10 +73,10 @@ def with_outputs(**fields: object) -> Callable[[Tick], Tick]:
     return lambda tick: replace(tick, outputs=replace(tick.outputs, **fields))
 
 
-def run(log: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+def run(log: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[int, str, str]:
     parser = argparse.ArgumentParser()
     calibrate.add_parser(parser.add_subparsers())
-    options = parser.parse_args(["calibrate", "hover", str(log)])
+    options = parser.parse_args(["calibrate", "hover", str(log), *more])
     code = options.run(options)
     told = capsys.readouterr()
     return code, told.out, told.err
@@ -99,6 +100,24 @@ def test_the_true_map_is_found_and_fits_into_the_configuration(
     out_file.write_text((Path(__file__).parents[2] / "configs" / "desk.yaml").read_text().split("devices:")[0] + out)
     assert load_config(str(out_file)).devices.autopilot.thrust == found
     assert run(log, capsys)[1] == out
+
+
+def test_the_map_is_written_into_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, mine = log_of(tmp_path, hovering(20.0)), tmp_path / "mine.yaml"
+    text = (Path(__file__).parents[2] / "configs" / "desk.yaml").read_text()
+    mine.write_text(text)
+    code, out, _ = run(log, capsys, "--config", str(mine))
+    assert code == 0
+    assert out.splitlines()[-1] == f"{mine}: written"
+    printed = yaml.safe_load(run(log, capsys)[1])["devices"]["autopilot"]["thrust"]
+    assert load_config(str(mine)).devices.autopilot.thrust == msgspec.convert(printed, ThrustMap)
+    assert [line for line in text.splitlines() if "#" in line] == [
+        line for line in mine.read_text().splitlines() if "#" in line
+    ]
+    assert run(log, capsys, "--config", str(mine))[1].endswith("holds this already\n")
+    code, _, err = run(log, capsys, "--config", "desk")
+    assert code == 2
+    assert "belongs to the program" in err
 
 
 def test_the_map_that_was_in_force_is_taken_from_the_log(tmp_path: Path) -> None:
@@ -143,7 +162,7 @@ def test_what_is_not_hover_does_not_count(tmp_path: Path, change: Callable[[Tick
     ticks = [change(tick) if tick.index >= 1750 and tick.index % 125 == 60 else tick for tick in ticks]
     assert len(read(log_of(tmp_path, iter(ticks))).points) == 14
     short = [change(tick) if tick.index >= 1000 else tick for tick in ticks]
-    with pytest.raises(HoverError, match=r"4 s of hover; at least 5 s are needed.*request hold"):
+    with pytest.raises(CalibrationError, match=r"4 s of hover; at least 5 s are needed.*request hold"):
         read(log_of(tmp_path, iter(short)))
 
 
