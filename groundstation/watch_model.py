@@ -17,7 +17,7 @@ from msgspec import Struct
 
 from groundstation.client import Contact
 from groundstation.follow import GROUND
-from onboard.messages import Action, Pipe, SafetyParams, Severity, Tick
+from onboard.messages import Action, Pipe, Severity, Tick
 from onboard.wire import Telemetry, Told, VehiclePulse
 
 #: A tick older than this is not live, s.
@@ -49,11 +49,23 @@ class Link(StrEnum):
     """Nothing is heard of the vehicle."""
 
 
+class Bounds(Struct, frozen=True):
+    """The bounds of safety that values are shown against; others are left unread, and may be of another version."""
+
+    temperature_warm: float
+    temperature_hot: float
+    battery_low: float
+    battery_low_voltage: float
+    battery_critical: float
+    battery_critical_voltage: float
+    tick_late: float
+
+
 class Known(Struct, frozen=True):
     """What is read of the vehicle's configuration."""
 
     pipe: Pipe
-    safety: SafetyParams
+    safety: Bounds
 
 
 class Force(Struct, frozen=True, gc=False):

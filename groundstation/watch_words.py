@@ -28,7 +28,7 @@ from groundstation.watch_marks import (
 )
 from groundstation.watch_model import SILENT, Link, View, clearance
 from groundstation.watch_orders import Order
-from onboard.messages import CONDITIONS, Action, Phase, Severity
+from onboard.messages import Action, Phase, Severity
 from onboard.wire import Outcome
 
 P, T = Phase, Tone
@@ -338,12 +338,8 @@ def _loop(view: View) -> Iterator[Span]:
 
 
 def _sentence(view: View, code: str) -> str:
-    """What a condition means: as the vehicle told it, else what it says of the bounds, else its name."""
-    if code in view.sentences:
-        return view.sentences[code]
-    if code in CONDITIONS and view.known is not None:
-        return f"{CONDITIONS[code][0].format(p=view.known.safety).capitalize()}."
-    return f"{code.replace('_', ' ')}."
+    """What a condition means: as the vehicle told it when it began, else its name."""
+    return view.sentences.get(code, f"{code.replace('_', ' ')}.")
 
 
 def _answer(order: Order, now_ns: int) -> Span:

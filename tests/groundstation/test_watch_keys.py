@@ -245,7 +245,7 @@ def test_a_lease_that_was_ours_before_stays_ours(vehicle: Vehicle) -> None:
 
 def test_the_configuration_is_asked_for_once_for_each_version(vehicle: Vehicle) -> None:
     config = load_config("paper", sets=["pipe.radius=0.1"])
-    vehicle.data = dump_config(config).encode()
+    vehicle.data = dump_config(config).encode() + b"of_tomorrow: {this: 1}\n"
     shown = Shown(vehicle, ShowParams(), read_known, Clock())
     for version in ((0, 1), (0, 1), (0, 2)):
         shown.look(version)
@@ -253,7 +253,8 @@ def test_the_configuration_is_asked_for_once_for_each_version(vehicle: Vehicle) 
     assert vehicle.asks() == [ShowParams()] * 2
     assert shown.value is not None
     assert shown.value.pipe == config.pipe
-    assert shown.value.safety == config.safety
+    for name in shown.value.safety.__struct_fields__:
+        assert getattr(shown.value.safety, name) == getattr(config.safety, name)
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,10 @@ import msgspec
 from msgspec.structs import replace
 
 from groundstation.client import Contact
-from groundstation.watch_model import Known, Model, View
+from groundstation.watch_model import Bounds, Known, Model, View
 from onboard.config import dump_config, load_config
+from onboard.core.safety import Params as SafetyParams
 from onboard.core.types import Event, Phase, Severity, Tick
-from onboard.messages import Pipe, SafetyParams
 from onboard.wire import Ack, Ask, Heard, Outcome, ShowEvents, ShowParams, Telemetry, Told, VehiclePulse
 from tests.synthetic import PIPE, mission
 
@@ -22,7 +22,7 @@ S = 1_000_000_000
 TICKS = [tick for tick, _ in mission()]
 #: Our monotonic clock at the start, and how much the vehicle's is behind it.
 START, BEHIND = 5_000 * S, 4_321 * S
-KNOWN = Known(Pipe(PIPE.position, PIPE.heading_deg, radius=PIPE.radius), SafetyParams())
+KNOWN = Known(PIPE, msgspec.convert(SafetyParams(), Bounds, from_attributes=True))
 
 
 def first(phase: Phase, after: int = 0) -> Tick:
