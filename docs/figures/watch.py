@@ -32,7 +32,7 @@ from onboard.messages import Phase, Tick
 from onboard.wire import Ack, ShowEvents, ShowParams
 
 #: When a picture is taken, s of the phase; how long the link is cut then, s; how long is flown before the first, s.
-HOVER, PRESS, CUT, BEFORE = (Phase.TARE, 1.5), (Phase.PRESS, 14.0), 3.0, 5.0
+HOVER, PRESS, CUT, BEFORE = (Phase.TARE, 1.5), (Phase.PRESS, 14.0), 3.0, 32.0
 SIZE = (80, 24)
 #: Of every so many ticks of the log one is put into the link, which sends fewer.
 EVERY = 5
