@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import signal
 import time
 from collections.abc import Callable, Collection
 from typing import ClassVar, Final, Protocol
@@ -97,7 +99,7 @@ class WatchApp(App[None]):
         self._before = Shown(source, ShowEvents(), read_events, clock)
         self._orders = Orders(source, clock, timeout)
         self._lease = LeaseKeeper(self._orders) if lease else None
-        self._view = View(clock(), source.station)
+        self._view = View(clock(), source.station, source.session)
         self._alarmed = False
 
     def compose(self) -> ComposeResult:
@@ -122,6 +124,8 @@ class WatchApp(App[None]):
         for name in ("vehicle", "arm", "link", "events"):
             self.query_one(f"#{name}", Part).border_title = name.capitalize()
         self.query_one("#force", Part).border_title = f"Estimated force, last {TREND:g} s"
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            asyncio.get_running_loop().add_signal_handler(number, self.exit)
         self.look()
         self.set_interval(_PERIOD, self.look)
 
@@ -140,7 +144,9 @@ class WatchApp(App[None]):
 
     def release(self) -> ReleaseLease | None:
         """What is to be asked once the screen is closed."""
-        return self._lease.release(self._view.commander, self._source.station) if self._lease is not None else None
+        if self._lease is None or not self._view.alone:
+            return None
+        return self._lease.release(self._view.commander, self._source.station)
 
     def look(self) -> None:
         """Look at the vehicle once, and show what is seen."""
@@ -162,7 +168,7 @@ class WatchApp(App[None]):
 
     def _press(self, key: str) -> None:
         view = self._view
-        match self._hand.press(key, self._clock(), needed=view.flying and view.commanding):
+        match self._hand.press(key, self._clock(), needed=view.flying and view.commanding and view.alone):
             case Leave():
                 self.exit()
                 return

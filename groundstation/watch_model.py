@@ -91,6 +91,8 @@ class View(Struct, frozen=True):
     now_ns: int
     station: str
     """Our name."""
+    session: str
+    """Of this screen."""
     contact: Contact = Contact()
     link: Link = Link.LOST
     silent: float = math.inf
@@ -134,6 +136,12 @@ class View(Struct, frozen=True):
     def commanding(self) -> bool:
         """We do."""
         return self.commander == self.station
+
+    @property
+    def alone(self) -> bool:
+        """No other session of our name is there, to command when this one is gone."""
+        stations = self.contact.pulse.stations if self.contact.pulse is not None else ()
+        return not any(h.present and h.name == self.station and h.session != self.session for h in stations)
 
     @property
     def action(self) -> Action:
@@ -182,6 +190,7 @@ class Model:
         return View(
             now_ns=now_ns,
             station=self._station,
+            session=self._session,
             contact=contact,
             link=_link(contact, silent, unheard),
             silent=silent,

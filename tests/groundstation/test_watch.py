@@ -8,6 +8,7 @@ import os
 import pty
 import re
 import select
+import signal
 import struct
 import subprocess
 import sys
@@ -127,6 +128,7 @@ def test_a_person_at_a_terminal(link: Link, environment: dict[str, str]) -> None
         terminal.sees("PREFLIGHT")
         terminal.sees("live")
         seconds_until(lambda: link.state().commander == "alice")
+        terminal.sees("you ")
         terminal.types("s")
         terminal.sees("stop done")
         terminal.types("q")
@@ -134,5 +136,21 @@ def test_a_person_at_a_terminal(link: Link, environment: dict[str, str]) -> None
         assert terminal.process.wait(LONG) == codes.DONE
         assert terminal.restored()
         assert link.state().commander == ""
+    finally:
+        terminal.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=["SIGTERM", "SIGHUP"])
+def test_ended_from_outside_it_leaves_in_order(link: Link, number: signal.Signals) -> None:
+    command = [sys.executable, "-c", _PROGRAM, "watch", "--plain", "--vehicle", "falcon", "--station", "alice"]
+    terminal = Terminal([*command, "--connect", link._settings.listen[0], "--lease"], 80, 24, TERM="xterm-256color")
+    try:
+        terminal.sees("live")
+        seconds_until(lambda: link.state().commander == "alice")
+        terminal.sees("you ")
+        terminal.process.send_signal(number)
+        terminal.sees(r"\x1b\[\?1049l.*alice commands no more\.")
+        assert terminal.process.wait(LONG) == codes.DONE
+        assert terminal.restored()
     finally:
         terminal.close()

@@ -20,7 +20,7 @@ from onboard.config import dump_config, load_config
 from onboard.core.types import Event, Phase, Request, Severity
 from onboard.link import Asked, Link
 from onboard.link_settings import LinkSettings
-from onboard.wire import Ack, Ask, Mission, Outcome, ReleaseLease, ShowEvents, ShowParams, Stop, TakeLease
+from onboard.wire import Ack, Ask, Heard, Mission, Outcome, ReleaseLease, ShowEvents, ShowParams, Stop, TakeLease
 from tests.groundstation.watching import TICKS, Puppet, first
 from tests.waiting import LONG
 from tests.zenoh_sessions import free_port
@@ -222,6 +222,20 @@ async def test_quit_is_not_asked_about_otherwise(puppet: Puppet, commander: str,
     async with app.run_test() as pilot:
         await pilot.press("q")
         await until(pilot, lambda: not app.is_running, "it ends")
+
+
+@pytest.mark.asyncio
+async def test_a_lease_that_another_terminal_keeps_is_not_given_up(puppet: Puppet) -> None:
+    puppet.others = (Heard("alice", "a2", 1, 0, True),)
+    puppet.later(0.1)
+    app = watch(puppet, lease=True)
+    async with app.run_test() as pilot:
+        await until(pilot, lambda: puppet.asked == [TakeLease()], "the lease is asked for")
+        puppet.commander = "alice"
+        await passes(pilot, puppet, 0.5)
+        await pilot.press("q")
+        await until(pilot, lambda: not app.is_running, "it ends")
+    assert app.release() is None
 
 
 @pytest.mark.asyncio

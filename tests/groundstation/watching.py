@@ -45,6 +45,7 @@ class Puppet:
         self.dt = 0.004
         """Between two ticks, as a tick says, s."""
         self.events: deque[Told] = deque()
+        self.others: tuple[Heard, ...] = (Heard("bob", "b1", 1, 0, True),)
         self.remembered: tuple[Told, ...] = ()
         self.missed = 0
         self.asked: list[Ask] = []
@@ -74,7 +75,7 @@ class Puppet:
         if self.hears:
             self._echo_ns = heard
         held = heard - self._echo_ns
-        stations = (Heard("alice", "a1", self._echo_ns, held, True), Heard("bob", "b1", 1, 0, True))
+        stations = (Heard("alice", "a1", self._echo_ns, held, True), *self.others)
         self._pulse = VehiclePulse(sent, sent + 1_700_000_000 * S, self._tick_ns, self.commander, stations, 0, 0)
         if self.tick is not None and self.ticks:
             inputs = replace(self.tick.inputs, t_ns=sent, dt=self.dt)
