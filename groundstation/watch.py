@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import Any
 
-from groundstation import station
+from groundstation import codes, station
 
 _EPILOG = """\
 keys:
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
 
     with station.open_client(options) as client:
         app = WatchApp(client, lease=options.lease, timeout=options.timeout)
-        app.run()
+        app.run(mouse=False)  # so that the terminal still selects text, and nothing but keys comes in
         if (release := app.release()) is not None:
             print(client.ask(release, timeout=options.timeout).text)
-    return app.return_code or 0
+    return app.return_code or codes.DONE

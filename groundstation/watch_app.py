@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import signal
 import time
 from collections.abc import Callable, Collection
 from typing import ClassVar, Final, Protocol
@@ -97,7 +99,7 @@ class WatchApp(App[None]):
         self._before = Shown(source, ShowEvents(), read_events, clock)
         self._orders = Orders(source, clock, timeout)
         self._lease = LeaseKeeper(self._orders) if lease else None
-        self._view = View(clock(), source.station)
+        self._view = View(clock(), source.station, source.session)
         self._alarmed = False
 
     def compose(self) -> ComposeResult:
@@ -122,8 +124,10 @@ class WatchApp(App[None]):
         for name in ("vehicle", "arm", "link", "events"):
             self.query_one(f"#{name}", Part).border_title = name.capitalize()
         self.query_one("#force", Part).border_title = f"Estimated force, last {TREND:g} s"
-        self._look()
-        self.set_interval(_PERIOD, self._look)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            asyncio.get_running_loop().add_signal_handler(number, self.exit)
+        self.look()
+        self.set_interval(_PERIOD, self.look)
 
     def on_key(self, event: Key) -> None:
         """Hand it on."""
@@ -140,21 +144,12 @@ class WatchApp(App[None]):
 
     def release(self) -> ReleaseLease | None:
         """What is to be asked once the screen is closed."""
-        return self._lease.release(self._view.commander, self._source.station) if self._lease is not None else None
+        if self._lease is None or not self._view.alone:
+            return None
+        return self._lease.release(self._view.commander, self._source.station)
 
-    def _press(self, key: str) -> None:
-        view = self._view
-        match self._hand.press(key, self._clock(), needed=view.flying and view.commanding):
-            case Leave():
-                self.exit()
-                return
-            case None:
-                pass
-            case order:
-                self._orders.give(order.name, order.ask)
-        self._look()
-
-    def _look(self) -> None:
+    def look(self) -> None:
+        """Look at the vehicle once, and show what is seen."""
         source, known = self._source, self._known
         contact, now = source.contact(), self._clock()
         events = gathered(self._before.value or (), tuple(source.events), contact.pulse)
@@ -170,6 +165,18 @@ class WatchApp(App[None]):
         scene = Scene(source.vehicle, view, tuple(orders), self._hand.question(now))
         for part in self.query(Part):
             part.show(scene)
+
+    def _press(self, key: str) -> None:
+        view = self._view
+        match self._hand.press(key, self._clock(), needed=view.flying and view.commanding and view.alone):
+            case Leave():
+                self.exit()
+                return
+            case None:
+                pass
+            case order:
+                self._orders.give(order.name, order.ask)
+        self.look()
 
     def _ring(self, before: View, view: View) -> None:
         """Once when the link is lost or the loop stops, and when safety begins to act."""

@@ -130,9 +130,14 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min"
 
 
+def within(seconds: float) -> str:
+    """A bound of an age, up to the next tenth of a second, so that what jitters below is not shown anew each time."""
+    return duration(max(math.ceil(seconds * 10 - 1e-6), 1) / 10) if math.isfinite(seconds) else duration(seconds)
+
+
 def ago(seconds: float) -> str:
-    """An age in words."""
-    return f"{duration(seconds)} ago" if math.isfinite(seconds) else "never"
+    """A bound of an age in words."""
+    return f"{within(seconds)} ago" if math.isfinite(seconds) else "never"
 
 
 def number(value: float, form: str) -> str:

@@ -17,7 +17,7 @@ from msgspec import Struct
 
 from groundstation.client import Contact
 from groundstation.follow import GROUND
-from onboard.messages import Action, Pipe, SafetyParams, Severity, Tick
+from onboard.messages import Action, Pipe, Severity, Tick
 from onboard.wire import Telemetry, Told, VehiclePulse
 
 #: A tick older than this is not live, s.
@@ -49,11 +49,23 @@ class Link(StrEnum):
     """Nothing is heard of the vehicle."""
 
 
+class Bounds(Struct, frozen=True):
+    """The bounds of safety that values are shown against; others are left unread, and may be of another version."""
+
+    temperature_warm: float
+    temperature_hot: float
+    battery_low: float
+    battery_low_voltage: float
+    battery_critical: float
+    battery_critical_voltage: float
+    tick_late: float
+
+
 class Known(Struct, frozen=True):
     """What is read of the vehicle's configuration."""
 
     pipe: Pipe
-    safety: SafetyParams
+    safety: Bounds
 
 
 class Force(Struct, frozen=True, gc=False):
@@ -79,6 +91,8 @@ class View(Struct, frozen=True):
     now_ns: int
     station: str
     """Our name."""
+    session: str
+    """Of this screen."""
     contact: Contact = Contact()
     link: Link = Link.LOST
     silent: float = math.inf
@@ -122,6 +136,12 @@ class View(Struct, frozen=True):
     def commanding(self) -> bool:
         """We do."""
         return self.commander == self.station
+
+    @property
+    def alone(self) -> bool:
+        """No other session of our name is there, to command when this one is gone."""
+        stations = self.contact.pulse.stations if self.contact.pulse is not None else ()
+        return not any(h.present and h.name == self.station and h.session != self.session for h in stations)
 
     @property
     def action(self) -> Action:
@@ -170,6 +190,7 @@ class Model:
         return View(
             now_ns=now_ns,
             station=self._station,
+            session=self._session,
             contact=contact,
             link=_link(contact, silent, unheard),
             silent=silent,

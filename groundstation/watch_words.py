@@ -11,16 +11,32 @@ from datetime import datetime
 from typing import Final
 
 from drivers.samples import SERVO_NAMES
-from groundstation.watch_marks import Line, Span, Tone, ago, bar, cut, duration, faded, length, number, plot, wrapped
+from groundstation.watch_marks import (
+    Line,
+    Span,
+    Tone,
+    ago,
+    bar,
+    cut,
+    duration,
+    faded,
+    length,
+    number,
+    plot,
+    within,
+    wrapped,
+)
 from groundstation.watch_model import SILENT, Link, View, clearance
 from groundstation.watch_orders import Order
-from onboard.messages import CONDITIONS, Action, Phase, Severity
+from onboard.messages import Action, Phase, Severity
 from onboard.wire import Outcome
 
 P, T = Phase, Tone
 
 #: A sample of a device is old after this time, s.
 OLD: Final = 0.5
+#: Below this width the head line says less.
+_ROOMY: Final = 40
 #: Tip and pipe touch within this distance, m; for the word alone.
 _NEAR: Final = 0.001
 _PHASES: Final = {
@@ -61,13 +77,14 @@ def head(view: View, vehicle: str, width: int) -> Line:
         name, words = outputs.phase.replace("_", " ").upper(), _PHASES.get(outputs.phase, "")
         phase = ((f"{name}  {outputs.phase_time:.1f} s", T.STRONG), (f"  {words}", T.PLAIN))
         phase = faded(phase) if view.stale else phase
-    left: Line = ((f" {vehicle} ", T.LABEL), (" ", T.PLAIN), *phase)
+    roomy = width >= _ROOMY
+    left: Line = ((f" {vehicle}  " if roomy else " ", T.LABEL), *phase)
     if view.tick is None:
         right: Span = ("", T.PLAIN)
     elif view.stale:
         right = (f"○ {ago(view.age)} ", T.STALE)
     else:
-        right = (f"● live, {duration(view.age)} ", T.GOOD)
+        right = (f"● {'live, ' if roomy else ''}{within(view.age)} ", T.GOOD)
     left = cut(left, width - len(right[0]) - 1)
     return (*left, (" " * (width - length(left) - len(right[0])), T.PLAIN), right)
 
@@ -254,16 +271,13 @@ def events(view: View, width: int, rows: int) -> tuple[Line, ...]:
     """The newest events with their local time, the newest last, as many as there is room for."""
     lines: list[Line] = []
     for told in reversed(view.events):
-        event = told.event
-        mark, tone = _MARKS[event.severity]
-        stamp = f"{_clock(view, event.t_ns)} "
-        words = wrapped(f"{mark} {event.text}", width - len(stamp), rows, "  ")
-        first = ((stamp, T.LABEL), (words[0], tone))
-        rest = [((" " * len(stamp) + more, tone),) for more in words[1:]]
-        if lines and len(lines) + 1 + len(rest) > rows:
+        if (room := rows - len(lines)) <= 0:
             break
-        lines[:0] = [first, *rest]
-    return tuple(lines[-rows:]) if rows > 0 else ()
+        mark, tone = _MARKS[told.event.severity]
+        stamp = f"{_clock(view, told.event.t_ns)} "
+        first, *more = wrapped(f"{mark} {told.event.text}", width - len(stamp), room, "  ")
+        lines[:0] = [((stamp, T.LABEL), (first, tone)), *(((" " * len(stamp) + line, tone),) for line in more)]
+    return tuple(lines)
 
 
 def answers(orders: Sequence[Order], now_ns: int, width: int, rows: int) -> tuple[Line, ...]:
@@ -324,22 +338,18 @@ def _loop(view: View) -> Iterator[Span]:
 
 
 def _sentence(view: View, code: str) -> str:
-    """What a condition means: as the vehicle told it, else what it says of the bounds, else its name."""
-    if code in view.sentences:
-        return view.sentences[code]
-    if code in CONDITIONS and view.known is not None:
-        return f"{CONDITIONS[code][0].format(p=view.known.safety).capitalize()}."
-    return f"{code.replace('_', ' ')}."
+    """What a condition means: as the vehicle told it when it began, else its name."""
+    return view.sentences.get(code, f"{code.replace('_', ' ')}.")
 
 
 def _answer(order: Order, now_ns: int) -> Span:
     age = duration((now_ns - order.asked_ns) * 1e-9)
     text = order.text.removesuffix(".")
     match order.outcome:
+        case None if order.pending:
+            return f"… {order.name} asked {age} ago", T.WARN
         case None:
-            return (
-                (f"… {order.name}: {text}, {age} ago", T.BAD) if text else (f"… {order.name}: asked {age} ago", T.WARN)
-            )
+            return f"? {order.name} asked {age} ago: {text}", T.BAD
         case Outcome.REFUSED:
             return f"✗ {order.name} refused, {age} ago: {text}", T.BAD
         case outcome:

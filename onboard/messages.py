@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from onboard.admission import not_for, station_security
 from onboard.core.repair import Pipe, Repair
-from onboard.core.safety import WORDS as CONDITIONS
-from onboard.core.safety import Params as SafetyParams
 from onboard.core.types import Action, Event, Phase, Request, Severity, Tick
 from onboard.identity import Identity, IdentityError, load_identity
 from onboard.logfile import LogError, LogReader
@@ -28,7 +26,6 @@ from onboard.wire import NAME_RULE, is_name
 from sim_backend.plant import Truth
 
 __all__ = [
-    "CONDITIONS",
     "DEVICES",
     "EVENT",
     "KEYFRAME",
@@ -55,7 +52,6 @@ __all__ = [
     "Roster",
     "RosterError",
     "RunInfo",
-    "SafetyParams",
     "Severity",
     "Tick",
     "Timing",
