@@ -24,11 +24,14 @@ RESUMES = 5
 class Errand:
     """Watches the ticks of one run.
 
-    request: hands a request to the loop. longest: a mission that has not ended by then is broken off, s.
+    request: hands a request to the loop. longest: a mission that has not ended by then is broken off, s. commanded:
+    whether a person commands, who then ends the holds.
     """
 
-    def __init__(self, request: Callable[[Request], None], longest: float) -> None:
-        self._request = request
+    def __init__(
+        self, request: Callable[[Request], None], longest: float, commanded: Callable[[], bool] = lambda: False
+    ) -> None:
+        self._request, self._commanded = request, commanded
         self._longest = longest
         self._asked: set[Request] = set()
         self._calm_since: float | None = None
@@ -46,7 +49,7 @@ class Errand:
             if t >= START_AT and outputs.estimate.valid and not outputs.verdict.reasons:
                 self.ask_once(Request.START)
             return t < PATIENCE
-        if outputs.phase is Phase.HOLD:
+        if outputs.phase is Phase.HOLD and not self._commanded():
             self._end_hold(outputs, t)
         return outputs.phase is not Phase.STOPPED and t < self._longest
 

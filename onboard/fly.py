@@ -113,6 +113,7 @@ class _Flight:
         self._sentences: deque[str] = deque()
         self.began = False
         self._ready = self._reload_first = False
+        self._errand: Errand | None = None
         self._report_ns = 0
         self._until = inf if options.duration is None else options.duration
         self.ending = Ending(self._request)
@@ -160,7 +161,8 @@ class _Flight:
                 await asyncio.to_thread(stations.start)
                 self._stations = stations
             Thread(target=self._prune, args=(logs, config.logs.budget), name="prune", daemon=True).start()
-            self._errand = Errand(loop.request, LONGEST) if self._options.mission else None
+            if self._options.mission:
+                self._errand = Errand(loop.request, LONGEST, lambda: bool(self._link().commander))
             devices.on_look = self._look
             self._cpu = CpuMeter()
             for sentence in ask(config.process):

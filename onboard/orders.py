@@ -90,7 +90,8 @@ class Orders:
             case Stop():
                 self._emergency.stop(answered)
             case Mission(request=Request.KILL):
-                self._emergency.kill(answered)
+                self._emergency.kill()  # done, whatever the loop does; that the mission has seen it, an event tells
+                return asked.done("Killed: the motors and the servos' torque are cut until a reset.")
             case Mission(request=request):
                 self._loop.request(request, done=answered)
             case Go(phase=phase):

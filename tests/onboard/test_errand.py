@@ -74,6 +74,14 @@ def test_a_hold_that_comes_again_and_again_is_landed_in_the_end() -> None:
     assert asked == [*[Request.RESUME] * RESUMES, Request.LAND]
 
 
+def test_who_commands_ends_the_holds() -> None:
+    asked: list[Request] = []
+    run = Errand(asked.append, 100.0, lambda: True)
+    for k in range(900):
+        assert run.goes_on(held(0.1 * k), 0.1 * k)
+    assert asked == []
+
+
 def test_a_hold_without_end_is_landed() -> None:
     run, asked = errand()
     run.goes_on(held(LONGEST_HOLD + 0.1, Action.HOLD), 50.0)

@@ -70,7 +70,6 @@ class House:
 
     def kill(self, done: Callable[[Outputs], None] | None = None) -> None:
         self.asked.append(("kill",))
-        self.done = done
 
     # the reloader
     def ask(self, load: Callable[[], Params] | None = None, done: Done | None = None) -> None:
@@ -107,7 +106,6 @@ def house() -> House:
         (Arm(), (Request.ARM, None)),
         (Tare(), (Request.TARE, None)),
         (Stop(), ("stop",)),
-        (Mission(Request.KILL), ("kill",)),
     ],
 )
 def test_it_is_handed_on_and_settled_by_the_tick_that_took_it(
@@ -117,6 +115,11 @@ def test_it_is_handed_on_and_settled_by_the_tick_that_took_it(
     assert house.asked == [handed_on]
     assert house.settled == []
     assert house.tick(ALARM, HOVERING) == Ack("o1", Outcome.DONE, HOVERING.text)
+
+
+def test_a_kill_is_done_whatever_the_loop_does(house: House) -> None:
+    assert house.order(Mission(Request.KILL)).outcome is Outcome.DONE
+    assert house.asked == [("kill",)]
 
 
 def test_what_the_mission_refuses_is_refused_with_its_words(house: House) -> None:
