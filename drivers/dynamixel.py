@@ -82,7 +82,7 @@ class Dynamixel:
         self._teller = Teller(self._notices, clock, "servo bus")
         self._set_up = SetUp(settings, self._servos, self._teller.tell)
         self._goals = Goals(settings, self._servos, self._set_up, self._teller)
-        self._watch = Watch(settings, self._servos, self._set_up, self._teller, clock)
+        self._watch = Watch(settings, self._servos, self._set_up, self._teller, clock, lambda: self._off_due)
         self._bus: Bus | None = None
         self._thread: Thread | None = None
         self._stopping = False

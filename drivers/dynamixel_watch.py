@@ -22,7 +22,10 @@ _WAKING = 0.3  # s that a servo needs to restart, generously
 
 
 class Watch:
-    """Reads the servos, ``clock`` in nanoseconds, and takes care of those in trouble."""
+    """Reads the servos, ``clock`` in nanoseconds, and takes care of those in trouble.
+
+    ``pressed``: something urgent waits for the bus, so that what takes several answers is left for later.
+    """
 
     def __init__(
         self,
@@ -31,7 +34,9 @@ class Watch:
         set_up: SetUp,
         teller: Teller,
         clock: Callable[[], int],
+        pressed: Callable[[], bool],
     ) -> None:
+        self._pressed = pressed
         self._settings = settings
         self._servos = servos
         self._set_up = set_up
@@ -56,7 +61,12 @@ class Watch:
         asked = [servo for servo in self._servos if servo.answers]
         if self._one_by_one:
             self._one_by_one = False
-            heard = [self._read_alone(bus, servo) for servo in asked]
+            heard = []
+            for servo in asked:
+                if self._pressed():
+                    self._one_by_one = True
+                    break
+                heard.append(self._read_alone(bus, servo))
         else:
             heard = self._read_together(bus, [servo for servo in asked if not servo.suspect])
             # One of them in a cycle, so that a cycle waits for one missing answer at most.
@@ -168,6 +178,8 @@ class Watch:
     def tend(self, bus: Bus, now: int) -> None:
         """Tell what there is; and at most one thing beside the cycle: reboot, find or look at the health of a servo."""
         self._tell(now)
+        if self._pressed():
+            return
         for servo in self._servos:
             try:
                 if servo.reboot_ns is not None and servo.answers and now >= servo.reboot_ns:

@@ -12,6 +12,7 @@ import socket
 import struct
 import sys
 import time
+from collections.abc import Callable
 
 import msgspec
 from msgspec import Struct
@@ -34,16 +35,15 @@ class Arrivals(Struct):
     bare: list[int]
 
 
-def _message(datagram: bytes) -> int:
+def message_of(datagram: bytes) -> int:
     """Number of the first MAVLink 2 message, or -1."""
     return int.from_bytes(datagram[7:10], "little") if len(datagram) >= 12 and datagram[0] == 0xFD else -1
 
 
-def main() -> None:
-    """Serve until standard input closes."""
+def serve(arrived: Callable[[bytes, int], None]) -> None:
+    """Tell the port, and serve until standard input closes; ``arrived`` hears each datagram and when it came, ns."""
     stand_in = Px4StandIn(world_of(load_config("desk")))
     stand_in.start()
-    arrivals = Arrivals([], [])
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there,
@@ -59,13 +59,9 @@ def main() -> None:
                 datagram, extra, _, sender = here.recvmsg(2048, 64)
                 offset = time.time_ns() - time.monotonic_ns()
                 seconds, nanoseconds = _TIMESPEC.unpack_from(extra[0][2])
-                stamp = seconds * 1_000_000_000 + nanoseconds - offset
-                if datagram.startswith(BARE):
-                    arrivals.bare.append(stamp)
-                else:
+                arrived(datagram, seconds * 1_000_000_000 + nanoseconds - offset)
+                if not datagram.startswith(BARE):
                     driver = sender
-                    if _message(datagram) == _SET_ATTITUDE_TARGET:
-                        arrivals.set_points.append(stamp)
                     there.send(datagram)
             if there in ready:
                 datagram = there.recv(2048)
@@ -74,6 +70,19 @@ def main() -> None:
             if sys.stdin in ready and not sys.stdin.read():
                 break
     stand_in.stop()
+
+
+def main() -> None:
+    """Note what comes until standard input closes."""
+    arrivals = Arrivals([], [])
+
+    def arrived(datagram: bytes, t_ns: int) -> None:
+        if datagram.startswith(BARE):
+            arrivals.bare.append(t_ns)
+        elif message_of(datagram) == _SET_ATTITUDE_TARGET:
+            arrivals.set_points.append(t_ns)
+
+    serve(arrived)
     print(msgspec.json.encode(arrivals).decode(), flush=True)
 
 

@@ -1,0 +1,197 @@
+"""How long a stop and a kill take from a station's call to the wire, under four conditions, beside raw Zenoh.
+
+Station and vehicle are processes of their own, as are autopilot and servos; all share one clock. A kill is over when
+the kernel has its MAVLink command in the queue of the autopilot's socket, and when the emulated bus has the packet that
+switches the torque off; a stop, when the first set-point has come that was made after it, or, for a loop that is stuck,
+the command to land.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import TypeVar
+
+import msgspec
+from msgspec import Struct
+
+from groundstation.authority import Authority
+from onboard.roster import Role
+from tests.bench.emergency.messages import StationOptions, Stations, Vehicle, VehicleOptions
+from tests.bench.emergency.vehicle import NAME
+from tests.lossy_network import ADDRESSES, LossyNetwork, UnavailableError
+from tests.zenoh_sessions import free_port
+
+LOSS, DELAY = 0.2, 0.2
+#: Through the lossy network so many stations ask at once, so that it does not take an hour; each rests as long, s.
+_STATIONS, _REST = 16, (0.5, 1.5)
+_PORT = 7447
+_LONGEST = 3600.0
+
+T = TypeVar("T")
+
+
+class Spread(Struct, frozen=True):
+    """A set of times, ms."""
+
+    median: float
+    p99: float
+    worst: float
+    count: int
+    missing: int = 0
+    """Of which nothing came; they are not in the other figures."""
+
+
+class Condition(Struct, frozen=True):
+    """What was measured under one condition. Times from the station's call on."""
+
+    name: str
+    kill: Spread
+    """To the autopilot's socket."""
+    limp: Spread
+    """Of the kill too, to the servo bus."""
+    stop: Spread
+    """To the autopilot's socket."""
+    answer: Spread
+    """To the vehicle's answer, at the station."""
+    put: Spread
+    """A raw message over a connection of its own, to the vehicle."""
+    get: Spread
+    """A raw query there and back."""
+
+
+class Emergency(Struct, frozen=True):
+    """Under all conditions."""
+
+    conditions: tuple[Condition, ...]
+    skipped: str = ""
+    """Why there was no lossy network."""
+
+
+def measure(trials: int = 1000) -> Emergency:
+    """``trials`` of stop and of kill under each condition. Raises RuntimeError when a process fails."""
+    conditions = [_loopback("loopback, idle", trials), _loopback("loopback, the loop stuck", trials, stuck=True)]
+    with _load():
+        conditions.append(_loopback(f"loopback, {os.cpu_count()} busy processes", trials))
+    through = f"{LOSS:.0%} lost, {DELAY * 1e3:.0f} ms each way"
+    try:
+        conditions.append(_lossy(through, trials, connections=3))
+        conditions.append(_lossy(f"{through}, one session for all", trials, connections=0))
+    except UnavailableError as error:
+        return Emergency(tuple(conditions), str(error))
+    return Emergency(tuple(conditions))
+
+
+@contextmanager
+def _load() -> Iterator[None]:
+    """Every processor has something else to do."""
+    with ExitStack() as stack:
+        for _ in range(os.cpu_count() or 1):
+            busy = stack.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+            stack.callback(busy.kill)
+        yield
+
+
+def _command(side: str, options: Struct) -> list[str]:
+    return [sys.executable, "-m", f"tests.bench.emergency.{side}", msgspec.json.encode(options).decode()]
+
+
+def _loopback(name: str, trials: int, *, stuck: bool = False) -> Condition:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with subprocess.Popen(
+        _command("vehicle", VehicleOptions(endpoint, stuck=stuck)),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as vehicle:
+        _ready(vehicle)
+        stations = subprocess.run(
+            _command("stations", StationOptions(endpoint, trials)),
+            stdout=subprocess.PIPE,
+            text=True,
+            check=False,
+            timeout=_LONGEST,
+        )
+        return _judge(name, _told(vehicle, Vehicle), _read(stations.stdout, Stations), stuck=stuck)
+
+
+def _lossy(name: str, trials: int, *, connections: int) -> Condition:
+    """With TLS, since nothing else is allowed off loopback. Raises UnavailableError."""
+    with TemporaryDirectory() as folder, LossyNetwork(LOSS, DELAY) as network:
+        keys = Path(folder) / "keys"
+        authority = Authority.init(keys)
+        authority.add(NAME, Role.VEHICLE, hosts=[ADDRESSES[0]])
+        for number in range(_STATIONS):
+            authority.add(f"s{number}", Role.OPERATOR)
+        asked = StationOptions(
+            f"tls/{ADDRESSES[0]}:{_PORT}", trials, _STATIONS, connections, _REST, str(keys), seed=connections
+        )
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        listening = VehicleOptions(f"tls/{ADDRESSES[0]}:{_PORT}", str(keys / NAME))
+        with network.start(_command("vehicle", listening), **pipes) as vehicle:
+            _ready(vehicle)
+            with network.start(_command("stations", asked), **pipes) as stations:
+                noted = _told(stations, Stations)
+            return _judge(name, _told(vehicle, Vehicle), noted)
+
+
+def _ready(vehicle: subprocess.Popen[str]) -> None:
+    assert vehicle.stdout is not None
+    if vehicle.stdout.readline() != "ready\n":
+        raise RuntimeError("the vehicle's side of the bench did not start")
+
+
+def _told(process: subprocess.Popen[str], kind: type[T]) -> T:
+    told, _ = process.communicate(timeout=_LONGEST)
+    return _read(told, kind)
+
+
+def _read(told: str, kind: type[T]) -> T:
+    if not told:
+        raise RuntimeError("a side of the bench has failed")
+    return msgspec.json.decode(told, type=kind)
+
+
+def _judge(name: str, vehicle: Vehicle, stations: Stations, *, stuck: bool = False) -> Condition:
+    """Put together what both sides have noted."""
+    heard = {order.id: order.t_ns for order in vehicle.orders}
+    frames = vehicle.frames
+    kills = [trial for trial in stations.trials if trial.kind == "kill"]
+    stops = [trial for trial in stations.trials if trial.kind == "stop"]
+
+    def first(arrivals: Sequence[int], order: str) -> int | None:
+        """The first arrival after the vehicle has heard an order: no earlier one can be of it."""
+        at = bisect_left(arrivals, heard[order]) if order in heard else len(arrivals)
+        return arrivals[at] if at < len(arrivals) else None
+
+    def stopped(order: str) -> int | None:
+        return first(frames.lands, order) if stuck else frames.marks.get(vehicle.marks.get(order, -1))
+
+    return Condition(
+        name,
+        kill=_spread([(trial.asked_ns, first(frames.kills, trial.id)) for trial in kills]),
+        limp=_spread([(trial.asked_ns, first(frames.limp, trial.id)) for trial in kills]),
+        stop=_spread([(trial.asked_ns, stopped(trial.id)) for trial in stops]),
+        answer=_spread([(trial.asked_ns, trial.answered_ns if trial.id else None) for trial in stations.trials]),
+        put=_spread([(at, vehicle.puts.get(index)) for index, at in stations.puts.items()]),
+        get=_spread([(0, took) for took in stations.gets]),
+    )
+
+
+def _spread(times: Sequence[tuple[int, int | None]]) -> Spread:
+    took = sorted((there - began) * 1e-6 for began, there in times if there is not None)
+    if not took:
+        raise RuntimeError("nothing came of what was asked")
+    ninety_ninth = took[min(len(took) - 1, round(0.99 * len(took)))]
+    return Spread(median(took), ninety_ninth, took[-1], len(took), len(times) - len(took))
+
+
+if __name__ == "__main__":
+    print(msgspec.json.format(msgspec.json.encode(measure(int(sys.argv[1]))), indent=1).decode())

@@ -1,0 +1,111 @@
+"""The stations' side: ``python -m tests.bench.emergency.stations OPTIONS``. Tells ``Stations`` as JSON."""
+
+from __future__ import annotations
+
+import random
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event, Thread
+
+import msgspec
+import zenoh
+
+from groundstation.client import Client, NoAnswerError, StationSettings
+from groundstation.urgent import Urgent
+from onboard.admission import Security, station_security
+from onboard.core.types import Request
+from onboard.endpoints import NoVehicleError, open_session
+from onboard.identity import load_identity
+from onboard.wire import Ack, Ask, Mission, Stop
+from tests.bench.emergency.messages import Kind, StationOptions, Stations, Trial
+from tests.bench.emergency.vehicle import NAME, RAW_GET, RAW_PUT
+
+#: For an answer, and for a connection through a bad network, s.
+_PATIENCE, _CONNECTING = 10.0, 60.0
+_ASKS: dict[Kind, Ask] = {"kill": Mission(Request.KILL), "stop": Stop()}
+
+
+def main() -> None:
+    """Ask, from all stations at once."""
+    options = msgspec.json.decode(sys.argv[1], type=StationOptions)
+    noted = Stations([], {}, [])
+    threads = [Thread(target=_station, args=(options, number, noted)) for number in range(options.stations)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    print(msgspec.json.encode(noted).decode(), flush=True)
+
+
+def _station(options: StationOptions, number: int, noted: Stations) -> None:
+    name = f"s{number}"
+    security: Security | None = None
+    if options.keys:
+        security = station_security(NAME, load_identity(Path(options.keys) / name))
+        del security["access_control"]
+    settings = StationSettings(NAME, (options.connect,), name, plain=not options.keys)
+    chance = random.Random(options.seed * 1000 + number)
+    pause = Event()
+    with _raw(settings, security) as raw, _asking(options, settings, security) as ask:
+        pause.wait(1.0)
+        for turn in range(number, options.trials, options.stations):
+            for kind in ("kill", "stop"):
+                pause.wait(chance.uniform(*options.rest))
+                noted.trials.append(_trial(ask, kind))
+                pause.wait(chance.uniform(*options.rest))
+                index = 2 * turn + (kind == "stop")
+                noted.puts[index] = time.monotonic_ns()
+                raw.put(RAW_PUT, str(index), express=True, priority=zenoh.Priority.REAL_TIME)
+                if index % 2:
+                    _get(raw, noted)
+
+
+def _trial(ask: Callable[[Ask], Ack], kind: Kind) -> Trial:
+    began = time.monotonic_ns()
+    try:
+        name = ask(_ASKS[kind]).id
+    except (NoAnswerError, NoVehicleError):
+        name = ""
+    return Trial(kind, name, began, time.monotonic_ns())
+
+
+def _get(raw: zenoh.Session, noted: Stations) -> None:
+    began = time.monotonic_ns()
+    for _ in raw.get(RAW_GET, timeout=_PATIENCE, express=True, priority=zenoh.Priority.REAL_TIME):
+        noted.gets.append(time.monotonic_ns() - began)
+
+
+@contextmanager
+def _raw(settings: StationSettings, security: Security | None) -> Iterator[zenoh.Session]:
+    session = open_session(
+        "client",
+        settings.connect,
+        plain=settings.plain,
+        lease=2.0,
+        security=security or {},
+        timeout=_CONNECTING,
+    )
+    with session:
+        yield session
+
+
+@contextmanager
+def _asking(
+    options: StationOptions, settings: StationSettings, security: Security | None
+) -> Iterator[Callable[[Ask], Ack]]:
+    if not options.connections:
+        with Client(settings, timeout=_CONNECTING, security=security) as client:
+            yield lambda ask: client.ask(ask, timeout=_PATIENCE)
+        return
+    with Urgent(settings, security=security, connections=options.connections) as urgent:
+        end = time.monotonic() + _CONNECTING
+        while urgent.connections < options.connections and time.monotonic() < end:
+            time.sleep(0.05)
+        yield lambda ask: urgent.ask(ask, timeout=_PATIENCE)
+
+
+if __name__ == "__main__":
+    main()
