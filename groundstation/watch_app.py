@@ -1,4 +1,4 @@
-"""The screen of ``pipewright watch``: parts put together, looked at ten times a second, keys handed on at once."""
+"""The screen of ``pipewright watch``: parts put together, looked at five times a second, keys handed on at once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from groundstation.watch_widgets import Part, Scene
 from onboard.messages import Action
 from onboard.wire import ReleaseLease, ShowEvents, ShowParams, Telemetry, Told
 
-_PERIOD: Final = 0.1
+_PERIOD: Final = 0.2
 #: The answer to an order is shown for this long, ns.
 _SHOWN_NS: Final = 60_000_000_000
 #: Rows of the force beside the trend, and of answers at most.
@@ -70,7 +70,6 @@ class WatchApp(App[None]):
     #alarm, #question, #verdict, #answers { height: auto; padding: 0 1; }
     #alarm, #question { background: #c01c28; color: #ffffff; text-style: bold; }
     .-empty { display: none; }
-    Part { text-wrap: nowrap; text-overflow: ellipsis; }
     #keys { height: 1; background: #1f2a3a; }
     #body { height: 1fr; scrollbar-size-vertical: 1; scrollbar-color: #3a4658; scrollbar-background: #11151c; }
     .row { height: auto; }

@@ -6,9 +6,12 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from msgspec import Struct
-from rich.text import Text
+from rich.segment import Segment
+from rich.style import Style
 from textual.events import Resize
-from textual.widgets import Static
+from textual.geometry import Region, Size
+from textual.strip import Strip
+from textual.widget import Widget
 
 from groundstation.watch_marks import Line, Tone
 from groundstation.watch_model import View
@@ -16,16 +19,16 @@ from groundstation.watch_orders import Order
 
 #: Grey, red, green and yellow have their like among sixteen colours, and all but grey are bold where it matters.
 STYLES: Final = {
-    Tone.PLAIN: "#d0d4da",
-    Tone.STRONG: "bold #ffffff",
-    Tone.LABEL: "#8a94a3",
-    Tone.GOOD: "#5fd787",
-    Tone.WARN: "bold #ffd75f",
-    Tone.BAD: "bold #ff6e67",
-    Tone.STALE: "#767676",
-    Tone.ESTIMATED: "#5fd7ff",
-    Tone.DESIRED: "bold #ffd75f",
-    Tone.LOUD: "bold",
+    Tone.PLAIN: Style.parse("#d0d4da"),
+    Tone.STRONG: Style.parse("bold #ffffff"),
+    Tone.LABEL: Style.parse("#8a94a3"),
+    Tone.GOOD: Style.parse("#5fd787"),
+    Tone.WARN: Style.parse("bold #ffd75f"),
+    Tone.BAD: Style.parse("bold #ff6e67"),
+    Tone.STALE: Style.parse("#767676"),
+    Tone.ESTIMATED: Style.parse("#5fd7ff"),
+    Tone.DESIRED: Style.parse("bold #ffd75f"),
+    Tone.LOUD: Style.parse("bold"),
 }
 
 
@@ -42,11 +45,11 @@ Draw = Callable[[Scene, int, int], tuple[Line, ...]]
 """Lines for a width and a height."""
 
 
-class Part(Static):
-    """Shows what ``draw`` makes of the scene. Sent anew only when it has changed, for the line may be slow."""
+class Part(Widget):
+    """Shows what ``draw`` makes of the scene. Only lines that have changed are sent, for the way may be slow."""
 
     def __init__(self, draw: Draw, **settings: Any) -> None:
-        super().__init__(markup=False, **settings)
+        super().__init__(**settings)
         self._draw = draw
         self._scene: Scene | None = None
         self._lines: tuple[Line, ...] = ()
@@ -60,22 +63,26 @@ class Part(Static):
         """Lines are made for a width and a height."""
         self._redraw()
 
+    def get_content_height(self, container: Size, viewport: Size, width: int) -> int:
+        """As many rows as there are lines."""
+        return len(self._lines)
+
+    def render_line(self, y: int) -> Strip:
+        """One row of the content."""
+        line = self._lines[y] if y < len(self._lines) else ()
+        strip = Strip([Segment(text, self.rich_style + STYLES[tone]) for text, tone in line])
+        return strip.adjust_cell_length(self.content_size.width, self.rich_style)
+
     def _redraw(self) -> None:
         if self._scene is None:
             return
         width, height = self.content_size
-        lines = self._draw(self._scene, width or self.app.size.width - 2, height)  # hidden, it has no size
-        if lines != self._lines:
-            grown = len(lines) != len(self._lines)
-            self._lines = lines
+        before = self._lines
+        self._lines = lines = self._draw(
+            self._scene, width or self.app.size.width - 2, height
+        )  # hidden, it has no size
+        if len(lines) != len(before):
             self.set_class(not lines, "-empty")
-            self.update(_text(lines), layout=grown)
-
-
-def _text(lines: tuple[Line, ...]) -> Text:
-    text = Text()
-    for i, line in enumerate(lines):
-        text.append("\n" if i else "")
-        for words, tone in line:
-            text.append(words, STYLES[tone])
-    return text
+            self.refresh(layout=True)
+        elif changed := [y for y, (old, new) in enumerate(zip(before, lines, strict=True)) if old != new]:
+            self.refresh(*(Region(0, y, width, 1) for y in changed))

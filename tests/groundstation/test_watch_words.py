@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from msgspec import Struct
 from msgspec.structs import replace
 from rich.color import ColorSystem
-from rich.style import Style
 
 from groundstation import watch_words as words
 from groundstation.watch_marks import Line, Tone, ago, bar, cut, duration, length, number, plot, wrapped
@@ -347,7 +346,7 @@ def test_what_is_no_number() -> None:
 @pytest.mark.parametrize("system", [ColorSystem.EIGHT_BIT, ColorSystem.STANDARD])
 def test_with_few_colours_what_is_old_still_differs_from_what_is_live(system: ColorSystem) -> None:
     def shown(tone: Tone) -> object:
-        color = Style.parse(STYLES[tone]).color
+        color = STYLES[tone].color
         assert color is not None
         return color.downgrade(system).number
 
