@@ -11,6 +11,7 @@ import pytest
 
 from onboard.logs import KEPT, PIECE, Logs
 from onboard.orders import NotShownError
+from tests.waiting import seconds_until
 
 
 def a_run(folder: Path, name: str, content: bytes = b"log", age: float = 0.0) -> Path:
@@ -25,12 +26,13 @@ def a_run(folder: Path, name: str, content: bytes = b"log", age: float = 0.0) ->
 
 def summed(logs: Logs, name: str) -> str:
     """The sum of a log, once it is there."""
-    for _ in range(1000):
-        (file,) = [file for file in logs.files() if file.name == name]
-        if file.sha256:
-            return file.sha256
-        time.sleep(0.01)
-    raise AssertionError(f"no sum of {name}")
+    seconds_until(lambda: bool(_sum(logs, name)))
+    return _sum(logs, name)
+
+
+def _sum(logs: Logs, name: str) -> str:
+    (file,) = [file for file in logs.files() if file.name == name]
+    return file.sha256
 
 
 def test_the_newest_run_comes_first(tmp_path: Path) -> None:
