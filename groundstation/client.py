@@ -18,7 +18,7 @@ from queue import Empty, SimpleQueue
 from threading import Condition, Thread
 from threading import Event as Flag
 from types import TracebackType
-from typing import Final, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 import zenoh
 from msgspec import Struct
@@ -34,6 +34,7 @@ from onboard.wire import (
     Telemetry,
     Told,
     VehiclePulse,
+    Way,
     WireError,
     encode,
     read_ack,
@@ -42,6 +43,9 @@ from onboard.wire import (
     read_vehicle_pulse,
     way_of,
 )
+
+if TYPE_CHECKING:
+    from groundstation.urgent import Urgent
 
 T = TypeVar("T")
 
@@ -108,6 +112,8 @@ class Client:
     ) -> None:
         self._settings, self._on_told, self._forbids = settings, on_told, forbids
         self.vehicle = settings.vehicle
+        self.urgent: Urgent | None = None
+        """Who asks for us what is urgent; None: we do."""
         self.station = settings.station or default_name()
         self.session = uuid.uuid4().hex[:12]
         """Name of this session among those of the station."""
@@ -185,6 +191,8 @@ class Client:
         identity = uuid.uuid4().hex
         if self._forbids is not None and (why := self._forbids(ask)):
             return Ack(identity, Outcome.REFUSED, why)
+        if self.urgent is not None and way_of(ask) is Way.SAFETY:
+            return self.urgent.ask(ask, timeout=timeout, settled=settled)
         key = self._keys.station(self.station, self.session, way_of(ask))
         answers: SimpleQueue[Ack | None] = SimpleQueue()
         self._orders[identity] = answers

@@ -11,7 +11,7 @@ from groundstation import codes, station
 from groundstation.events import Printer
 from groundstation.follow import AT_REST, follow
 from onboard.messages import Phase, Request
-from onboard.wire import Arm, Ask, Go, Mission, Stop, Tare
+from onboard.wire import Arm, Ask, Go, Mission, Stop, Tare, Way, way_of
 
 if TYPE_CHECKING:
     from groundstation.client import Client
@@ -120,9 +120,9 @@ def run(options: argparse.Namespace) -> int:
         raise station.WrongInputError("kill asks for confirmation, and here is no terminal to ask on: give --now")
     ask = order.ask if order.ask is not None else Go(Phase(options.phase))
     printer = Printer(options)
+    if way_of(ask) is Way.SAFETY:
+        return _urgently(options, printer, order, ask)
     with station.open_client(options, on_told=printer.hear) as client:
-        if options.order == "kill" and not options.now:
-            _confirm(client.vehicle)
         if order.moves:
             _accompanied(client)
         text = station.command(client, ask, options).text or f"{options.order}: done"
@@ -131,6 +131,21 @@ def run(options: argparse.Namespace) -> int:
             return codes.DONE
         if not options.json:
             print(text, flush=True)
+        return _wait(client, options, printer, order)
+
+
+def _urgently(options: argparse.Namespace, printer: Printer, order: _Order, ask: Ask) -> int:
+    """Ask as soon as any connection is there, and look only then what comes of it."""
+    with station.open_urgent(options) as urgent:
+        if options.order == "kill" and not options.now:
+            _confirm(urgent.vehicle)
+        text = station.ask(urgent, ask, options).text or f"{options.order}: done"
+    if not options.wait:
+        station.tell(options, text)
+        return codes.DONE
+    if not options.json:
+        print(text, flush=True)
+    with station.open_client(options, on_told=printer.hear) as client:
         return _wait(client, options, printer, order)
 
 

@@ -12,7 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -24,6 +24,8 @@ from onboard.wire import Ack, Ask, Outcome, Told, Way, way_of
 
 if TYPE_CHECKING:
     from groundstation.client import Client, StationSettings
+    from groundstation.urgent import Urgent
+    from onboard.endpoints import ZenohConfig
 
 CONNECT, VEHICLE, KEYS = "PIPEWRIGHT_CONNECT", "PIPEWRIGHT_VEHICLE", "PIPEWRIGHT_KEYS"
 _VEHICLE: Final = "pipewright"
@@ -88,27 +90,60 @@ def examples_of(prog: str, epilog: str) -> str:
 
 
 @contextmanager
-def open_client(options: argparse.Namespace, *, on_told: Callable[[Told], None] | None = None) -> Iterator[Client]:
+def open_client(
+    options: argparse.Namespace, *, on_told: Callable[[Told], None] | None = None, urgent: bool = False
+) -> Iterator[Client]:
     """The session of a command with its vehicle. What this station may not ask is refused without asking.
 
-    Raises WrongInputError for options that cannot be, LinkError, and NoVehicleError that tells why it is not seen.
+    urgent: for who stays, stop, retreat and kill have connections of their own. Raises WrongInputError for options
+    that cannot be, LinkError, and NoVehicleError that tells why it is not seen.
     """
     from groundstation.client import Client
-    from onboard.endpoints import NoVehicleError
+    from groundstation.urgent import Urgent
 
     identity = _identity(options)
     settings = settings_of(options, identity)
-    try:
-        security = None if identity is None else station_security(settings.vehicle, identity)
-    except IdentityError as error:
-        raise WrongInputError(str(error)) from None
+    security = _security(settings, identity)
     forbids = None if identity is None else lambda ask: not_for(identity, way_of(ask))
+    with ExitStack() as stack:
+        with _explained(settings, identity):
+            client = Client(settings, timeout=options.timeout, on_told=on_told, security=security, forbids=forbids)
+        stack.enter_context(client)
+        if urgent:
+            client.urgent = stack.enter_context(Urgent(settings, security=security))
+        yield client
+
+
+@contextmanager
+def open_urgent(options: argparse.Namespace) -> Iterator[Urgent]:
+    """Connections for what is urgent and for nothing else; they wait for no vehicle to be seen.
+
+    Raises as ``open_client``, but NoVehicleError only once something is asked.
+    """
+    from groundstation.urgent import Urgent
+
+    identity = _identity(options)
+    settings = settings_of(options, identity)
+    with Urgent(settings, security=_security(settings, identity)) as urgent, _explained(settings, identity):
+        yield urgent
+
+
+@contextmanager
+def _explained(settings: StationSettings, identity: Identity | None) -> Iterator[None]:
+    """Add to a NoVehicleError why the vehicle is not seen."""
+    from onboard.endpoints import NoVehicleError
+
     try:
-        client = Client(settings, timeout=options.timeout, on_told=on_told, security=security, forbids=forbids)
+        yield
     except NoVehicleError as error:
         raise NoVehicleError("\n".join([str(error), *_reasons(error, settings, identity)])) from None
-    with client:
-        yield client
+
+
+def _security(settings: StationSettings, identity: Identity | None) -> ZenohConfig | None:
+    try:
+        return None if identity is None else station_security(settings.vehicle, identity)
+    except IdentityError as error:
+        raise WrongInputError(str(error)) from None
 
 
 def settings_of(options: argparse.Namespace, identity: Identity | None) -> StationSettings:
@@ -158,7 +193,7 @@ def _reasons(error: Exception, settings: StationSettings, identity: Identity | N
 # --- asking, and saying what came of it -------------------------------------------------------------------------------
 
 
-def ask(client: Client, what: Ask, options: argparse.Namespace) -> Ack:
+def ask(client: Client | Urgent, what: Ask, options: argparse.Namespace) -> Ack:
     """Ask, and give the answer that is final. Raises RefusedError, NoVehicleError, NoAnswerError."""
     ack = client.ask(what, timeout=options.timeout, settled=True)
     if ack.outcome is Outcome.REFUSED:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 import uuid
 from contextlib import suppress
+from functools import partial
 from queue import Empty, SimpleQueue
 from threading import Condition, Thread
 from types import TracebackType
@@ -28,12 +29,16 @@ CONNECTIONS: Final = 3
 #: One attempt to connect; a handshake with TLS may need that long where packets are lost, s.
 _ATTEMPT: Final = 5.0
 _REST: Final = 0.2
+#: An order that nobody has taken so often finds nobody; on a new connection the vehicle is not known at once.
+_OFTEN: Final = 10
 
 
 class _Pending(Struct):
     order: Order
     answers: SimpleQueue[Ack]
     end: float
+    untaken: int = 0
+    """How often nobody has taken it."""
 
 
 class Urgent:
@@ -47,8 +52,9 @@ class Urgent:
         self, settings: StationSettings, *, security: ZenohConfig | None = None, connections: int = CONNECTIONS
     ) -> None:
         self._settings, self._security = settings, security or {}
-        station = settings.station or default_name()
-        self._key = keys_of(settings.vehicle, station).station(station, uuid.uuid4().hex[:12], Way.SAFETY)
+        self.vehicle, self.station = settings.vehicle, settings.station or default_name()
+        keys = keys_of(self.vehicle, self.station)
+        self._key = keys.station(self.station, uuid.uuid4().hex[:12], Way.SAFETY)
         self._changed = Condition()
         self._orders: dict[str, _Pending] = {}
         self._closing = False
@@ -110,8 +116,13 @@ class Urgent:
             raise self._wrong
         if not self._open and self._unreached is not None:
             raise self._unreached
+        if not accepted and pending.untaken >= _OFTEN:
+            raise NoVehicleError(
+                f"nobody at {', '.join(self._settings.connect)} takes orders for {self.vehicle} from {self.station}: "
+                "is that its name, is its link on, and is this station admitted?"
+            )
         what = "it was accepted, but is not done" if accepted else "no answer"
-        raise NoAnswerError(f"{self._settings.vehicle}: {what} within {timeout:g} s")
+        raise NoAnswerError(f"{self.vehicle}: {what} within {timeout:g} s")
 
     # --- one connection, in a thread of its own, so that one that blocks keeps no other -------------------------------
 
@@ -149,23 +160,21 @@ class Urgent:
         """Send what is pending, again and again, until it is answered."""
         due: dict[str, float] = {}
 
-        def soon(name: str) -> None:
+        def answered(pending: _Pending, ack: Ack | None) -> None:
+            if ack is not None:
+                pending.answers.put(ack)
+                return
+            now = time.monotonic()
             with self._changed:
-                if name in due:
-                    due[name] = min(due[name], time.monotonic() + SOON)
+                if (name := pending.order.id) in due and now < pending.end:
+                    pending.untaken += 1
+                    due[name] = min(due[name], now + SOON)
                     self._changed.notify_all()
 
         while (pending := self._next(due)) is not None:
-            name, answers = pending.order.id, pending.answers
-
-            def answered(ack: Ack | None, name: str = name, answers: SimpleQueue[Ack] = answers) -> None:
-                if ack is None:
-                    soon(name)
-                else:
-                    answers.put(ack)
-
+            left = max(pending.end - time.monotonic(), SOON)
             with suppress(zenoh.ZError):  # then it is sent again, here and elsewhere
-                send(session, self._key, pending.order, answered, max(pending.end - time.monotonic(), SOON))
+                send(session, self._key, pending.order, partial(answered, pending), left)
 
     def _next(self, due: dict[str, float]) -> _Pending | None:
         """Wait for what is to be sent next, and note when to send it again; None: no more."""

@@ -113,6 +113,12 @@ def test_no_answer(vehicle: Vehicle) -> None:
         relay.mend()
 
 
+def test_another_vehicle(vehicle: Vehicle) -> None:
+    other = StationSettings("x501", (f"tcp/127.0.0.1:{vehicle.port}",), "anna", plain=True)
+    with Urgent(other) as urgent, pytest.raises(NoVehicleError, match="takes orders for x501 from anna: is that"):
+        urgent.ask(KILL, timeout=2.0)
+
+
 def test_nobody_there() -> None:
     with Urgent(station(free_port())) as urgent, pytest.raises(NoVehicleError, match="is the vehicle on"):
         urgent.ask(KILL, timeout=7.0)
