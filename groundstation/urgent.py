@@ -19,13 +19,21 @@ from typing import Final, Self
 import zenoh
 from msgspec import Struct
 
-from groundstation.asking import AGAIN, PEER_LEASE, SOON, keys_of, send
+from groundstation.asking import AGAIN, SOON, keys_of, send
 from groundstation.client import NoAnswerError, StationSettings, default_name
 from onboard.endpoints import LinkError, NoVehicleError, ZenohConfig, open_session
 from onboard.wire import Ack, Ask, Order, Outcome, Way, way_of
 
 #: More of them gain little and want more of the network.
 CONNECTIONS: Final = 3
+#: The vehicle keeps a silent one for so long, s: a packet that is lost three times is silent for five.
+_LEASE: Final = 10.0
+#: An order without an answer is sent again after this time, s, then after half as much more, up to ``AGAIN``. What
+#: follows a lost packet soon tells TCP of the loss, which otherwise only a timeout does.
+_SOON_AGAIN: Final = 0.04
+#: Then another connection is made for it beside those that there are: after a cut they may sleep on for as long as it
+#: was, and s.
+_SPARE: Final = 1.0
 #: One attempt to connect; a handshake with TLS may need that long where packets are lost, s.
 _ATTEMPT: Final = 5.0
 _REST: Final = 0.2
@@ -61,9 +69,14 @@ class Urgent:
         self._open = 0
         self._unreached: NoVehicleError | None = None
         self._wrong: LinkError | None = None
-        self._lanes = [Thread(target=self._work, name=f"urgent.{i}", daemon=True) for i in range(connections)]
-        for lane in self._lanes:
-            lane.start()
+        self._lanes: list[Thread] = []
+        for _ in range(connections):
+            self._add()
+
+    def _add(self, only: str = "") -> None:
+        lane = Thread(target=self._work, args=(only,), name="urgent", daemon=True)
+        self._lanes.append(lane)
+        lane.start()
 
     def __enter__(self) -> Self:
         return self
@@ -99,9 +112,12 @@ class Urgent:
         with self._changed:
             self._orders[order.id] = pending
             self._changed.notify_all()
-        accepted = False
+        accepted, spare = False, time.monotonic() + _SPARE
         try:
             while self._wrong is None and (left := pending.end - time.monotonic()) > 0.0:
+                if self._open and not accepted and time.monotonic() > spare:
+                    spare = pending.end
+                    self._add(order.id)
                 try:
                     answer = pending.answers.get(timeout=min(left, _REST))
                 except Empty:
@@ -112,6 +128,7 @@ class Urgent:
         finally:
             with self._changed:
                 del self._orders[order.id]
+                self._changed.notify_all()
         if self._wrong is not None:
             raise self._wrong
         if not self._open and self._unreached is not None:
@@ -126,26 +143,30 @@ class Urgent:
 
     # --- one connection, in a thread of its own, so that one that blocks keeps no other -------------------------------
 
-    def _work(self) -> None:
-        session = self._connect()
+    def _work(self, only: str) -> None:
+        session = self._connect(only)
         if session is None:
             return
         self._count(1)
         try:
-            self._serve(session)
+            self._serve(session, only)
         finally:
             self._count(-1)
             session.close()
 
-    def _connect(self) -> zenoh.Session | None:
+    def _needed(self, only: str) -> bool:
+        """There may be more to send; with ``only``, of this order."""
+        return not self._closing and (not only or only in self._orders)
+
+    def _connect(self, only: str) -> zenoh.Session | None:
         settings = self._settings
-        while not self._closing:
+        while self._needed(only):
             try:
                 return open_session(
                     "client",
                     settings.connect,
                     plain=settings.plain,
-                    lease=PEER_LEASE,
+                    lease=_LEASE,
                     security=self._security,
                     timeout=_ATTEMPT,
                 )
@@ -156,9 +177,10 @@ class Urgent:
                 return None
         return None
 
-    def _serve(self, session: zenoh.Session) -> None:
+    def _serve(self, session: zenoh.Session, only: str) -> None:
         """Send what is pending, again and again, until it is answered."""
         due: dict[str, float] = {}
+        pauses: dict[str, float] = {}
 
         def answered(pending: _Pending, ack: Ack | None) -> None:
             if ack is not None:
@@ -171,21 +193,22 @@ class Urgent:
                     due[name] = min(due[name], now + SOON)
                     self._changed.notify_all()
 
-        while (pending := self._next(due)) is not None:
+        while (pending := self._next(due, pauses, only)) is not None:
             left = max(pending.end - time.monotonic(), SOON)
             with suppress(zenoh.ZError):  # then it is sent again, here and elsewhere
                 send(session, self._key, pending.order, partial(answered, pending), left)
 
-    def _next(self, due: dict[str, float]) -> _Pending | None:
+    def _next(self, due: dict[str, float], pauses: dict[str, float], only: str) -> _Pending | None:
         """Wait for what is to be sent next, and note when to send it again; None: no more."""
         with self._changed:
-            while not self._closing:
+            while self._needed(only):
                 for name in due.keys() - self._orders.keys():
-                    del due[name]
+                    del due[name], pauses[name]
                 now = time.monotonic()
                 for name, pending in self._orders.items():
                     if due.get(name, now) <= now < pending.end:
-                        due[name] = now + AGAIN
+                        pause = pauses.get(name, _SOON_AGAIN)
+                        due[name], pauses[name] = now + pause, min(1.5 * pause, AGAIN)
                         return pending
                 rest = min((at for at in due.values() if at > now), default=None)
                 self._changed.wait(None if rest is None else rest - now)

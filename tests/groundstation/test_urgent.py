@@ -25,11 +25,12 @@ KILL = Mission(Request.KILL)
 class Vehicle:
     """A link that notes what is asked of it."""
 
-    def __init__(self) -> None:
+    def __init__(self, lease: float = 2.0) -> None:
         self.port = free_port()
         self.asked: list[Asked] = []
         self.answer: Callable[[Asked], Ack] = lambda asked: asked.done("so be it")
-        self.link = Link(LinkSettings(vehicle="x500", listen=(f"tcp/127.0.0.1:{self.port}",), plain=True), self._hear)
+        listen = (f"tcp/127.0.0.1:{self.port}",)
+        self.link = Link(LinkSettings(vehicle="x500", listen=listen, plain=True, peer_lease=lease), self._hear)
 
     def _hear(self, asked: Asked) -> Ack:
         self.asked.append(asked)
@@ -39,6 +40,15 @@ class Vehicle:
 @pytest.fixture
 def vehicle() -> Iterator[Vehicle]:
     vehicle = Vehicle()
+    vehicle.link.start()
+    yield vehicle
+    vehicle.link.stop()
+
+
+@pytest.fixture
+def patient() -> Iterator[Vehicle]:
+    """One that gives a silent connection up after ten seconds only."""
+    vehicle = Vehicle(10.0)
     vehicle.link.start()
     yield vehicle
     vehicle.link.stop()
@@ -69,6 +79,18 @@ def test_connections_that_stand_still_do_not_matter(vehicle: Vehicle) -> None:
         assert urgent.ask(KILL, timeout=LONG).outcome is Outcome.DONE
         assert time.monotonic() - began < 1.5  # Zenoh gives the others up after 2 s
         assert [asked.ask for asked in vehicle.asked] == [Stop(), KILL]
+
+
+def test_when_all_stand_still_another_is_made(patient: Vehicle) -> None:
+    """As TCP does for a while after the network was cut and has come back."""
+    with Relay(patient.port) as relay, Urgent(station(relay.port)) as urgent:
+        seconds_until(lambda: urgent.connections == CONNECTIONS)
+        relay.hold(CONNECTIONS)
+        began = time.monotonic()
+        assert urgent.ask(KILL, timeout=LONG).outcome is Outcome.DONE
+        assert time.monotonic() - began < 4.0
+        assert len(patient.asked) == 1
+        seconds_until(lambda: urgent.connections == CONNECTIONS)
 
 
 def test_an_order_waits_for_no_other_connection(vehicle: Vehicle) -> None:

@@ -21,7 +21,7 @@ from onboard.endpoints import NoVehicleError, open_session
 from onboard.identity import load_identity
 from onboard.wire import Ack, Ask, Mission, Stop
 from tests.bench.emergency.messages import Kind, StationOptions, Stations, Trial
-from tests.bench.emergency.vehicle import NAME, RAW_GET, RAW_PUT
+from tests.bench.emergency.vehicle import LEASE, NAME, RAW_GET, RAW_PUT
 
 #: For an answer, and for a connection through a bad network, s.
 _PATIENCE, _CONNECTING = 10.0, 60.0
@@ -84,7 +84,7 @@ def _raw(settings: StationSettings, security: Security | None) -> Iterator[zenoh
         "client",
         settings.connect,
         plain=settings.plain,
-        lease=2.0,
+        lease=LEASE,
         security=security or {},
         timeout=_CONNECTING,
     )

@@ -52,6 +52,8 @@ from tests.synthetic import mission
 NAME = "x500"
 #: Keys of the raw messages: numbers that are put, and a query that is answered at once.
 RAW_PUT, RAW_GET = f"pipewright/{NAME}/raw/put", f"pipewright/{NAME}/raw/get"
+#: Of the link, s: with the default of 2 s a connection through a bad network is given up again and again.
+LEASE = 10.0
 _PERIOD_NS = 4_000_000
 #: After an order, until all is as before it, s.
 _RENEWED = 0.005
@@ -152,7 +154,7 @@ async def fly(options: VehicleOptions) -> Vehicle:
         if options.keys:
             security = vehicle_security(NAME, load_identity(Path(options.keys)), Roster())
             del security["access_control"]  # the raw messages have keys that nobody is allowed
-        settings = LinkSettings(vehicle=NAME, listen=(options.listen,), plain=not options.keys)
+        settings = LinkSettings(vehicle=NAME, listen=(options.listen,), plain=not options.keys, peer_lease=LEASE)
         link = Link(settings, rig.hear, security)
         link.start()
         try:
