@@ -75,7 +75,7 @@ class WatchApp(App[None]):
     .row { height: auto; }
     .panel { border-top: solid #3a4658; border-title-color: #9fb3cc; border-title-style: bold; padding: 0 1; }
     #force, #vehicle, #arm, #link { height: 7; }
-    #vehicle, #link { width: 36; }
+    #vehicle, #link { width: 37; }
     #force, #arm { width: 1fr; }
     #events { height: 1fr; min-height: 3; }
     .-tall #force, .-tall #vehicle { height: 12; }

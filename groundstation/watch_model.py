@@ -7,7 +7,9 @@ vehicle stamps T was made after E + (T - P) by our clock. Of the newest pulses t
 
 from __future__ import annotations
 
+import itertools
 import math
+import statistics
 from collections import deque
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
@@ -82,7 +84,7 @@ class Punctuality(Struct, frozen=True):
     rate: float = math.nan
     """Hz; of all ticks, also of those between."""
     worst: float = math.nan
-    """Longest time from one tick to the next, s; of the ticks that came."""
+    """Longest time from one tick to the next, s: of ticks that came, and of a stall between two that was not caught up."""
 
 
 class View(Struct, frozen=True):
@@ -250,7 +252,12 @@ class Model:
         first = next(tick for tick in self._ticks if last.inputs.t_ns - tick.inputs.t_ns <= RATE * 1e9)
         lasted = (last.inputs.t_ns - first.inputs.t_ns) * 1e-9
         rate = (last.index - first.index) / lasted if lasted > 0.0 else math.nan
-        return Punctuality(rate, max(tick.inputs.dt for tick in self._ticks))
+        steps = [
+            ((b.inputs.t_ns - a.inputs.t_ns) * 1e-9, b.index - a.index) for a, b in itertools.pairwise(self._ticks)
+        ]
+        period = statistics.median(time / count for time, count in steps)
+        lost = max(time - count * period for time, count in steps)
+        return Punctuality(rate, max(period + lost, *(tick.inputs.dt for tick in self._ticks)))
 
 
 def gathered(before: Sequence[Told], heard: Sequence[Told], pulse: VehiclePulse | None) -> tuple[Told, ...]:

@@ -141,7 +141,7 @@ def force(view: View, width: int) -> tuple[Line, ...]:
     desired, estimated = outputs.reference.force, outputs.estimate.contact_force
     touching = "in contact" if outputs.estimate.in_contact else "free"
     numbers: Line = (
-        (f"{number(estimated, '.2f')} N", T.ESTIMATED),
+        (f"{number(estimated, 'z.2f')} N", T.ESTIMATED),
         (" of ", T.LABEL),
         (f"{desired:.2f} N", T.DESIRED),
         (f" desired   {touching}", T.LABEL),
@@ -167,9 +167,9 @@ def vehicle(view: View, rows: int) -> tuple[Line, ...]:
     lines: list[Line] = [
         _row(
             "pitch",
-            flown(f"{number(math.degrees(estimate.rpy[1]), '+.2f')}°"),
+            flown(f"{number(math.degrees(estimate.rpy[1]), '+z.2f')}°"),
             ("   height ", T.LABEL),
-            seen(f"{number(estimate.p_WB[2], '.2f')} m"),
+            seen(f"{number(estimate.p_WB[2], 'z.2f')} m"),
         ),
         _row("tip", *seen.all(_tip(view))),
     ]
@@ -188,18 +188,18 @@ def vehicle(view: View, rows: int) -> tuple[Line, ...]:
             critical = left < bounds.battery_critical or volts < bounds.battery_critical_voltage
             tone = T.BAD if critical else T.WARN if low else T.PLAIN
         word = "critical" if tone is T.BAD else "low" if tone is T.WARN else ""
-        charge = f"{number(100 * left, '.0f')} %   {number(volts, '.2f')} V"
+        charge = f"{number(100 * left, 'z.0f')} %   {number(volts, 'z.2f')} V"
         lines.append(_row("battery", flown(charge, tone), flown(f"   {word}", tone)))
         armed = "armed" if autopilot.armed else "disarmed"
         lines.append(_row("autopilot", flown(f"{autopilot.mode}, {armed}"), ("   ", T.PLAIN), flown.age()))
     lines.append(_row("loop", *_loop(view)))
-    roll, _, yaw = (number(math.degrees(angle), "+.2f") for angle in estimate.rpy)
-    x, y, _ = (number(p, "+.2f") for p in estimate.p_WB)
+    roll, _, yaw = (number(math.degrees(angle), "+z.2f") for angle in estimate.rpy)
+    x, y, _ = (number(p, "+z.2f") for p in estimate.p_WB)
     clipped = ", ".join(name.replace("_", " ") for name in view.tick.outputs.clipped)
     lines += [
         _row("roll", flown(f"{roll}°"), ("   yaw ", T.LABEL), flown(f"{yaw}°")),
         _row("place", seen(f"{x}, {y} m")),
-        _row("speed", seen(f"{number(math.hypot(*estimate.v_WB), '.2f')} m/s")),
+        _row("speed", seen(f"{number(math.hypot(*estimate.v_WB), 'z.2f')} m/s")),
         _row("gate", (f"clips {clipped}", T.WARN) if clipped else ("clips nothing", T.PLAIN)),
         _row("parameters", (f"revision {view.tick.revision}", T.PLAIN)),
     ]
@@ -218,19 +218,19 @@ def arm(view: View) -> tuple[Line, ...]:
     bounds = view.known.safety if view.known is not None else None
     state = ("no torque", T.BAD) if not servos.torque_on and not device.old else device.age()
     titles = f"{'angle':>7}{'current':>8}{'volt':>6}{'temp':>6}"
-    lines: list[Line] = [((f"{state[0]:<9}", state[1]), (titles, T.LABEL))]
+    lines: list[Line] = [((f"{state[0]:<8}", state[1]), (titles, T.LABEL))]
     for i, name in enumerate(SERVO_NAMES):
         hot = T.PLAIN
         if bounds is not None and not servos.temperature[i] <= bounds.temperature_warm:
             hot = T.WARN if servos.temperature[i] <= bounds.temperature_hot else T.BAD
-        angle = f"{number(math.degrees(servos.position[i]), '+.1f')}°"
-        current, volts = f"{number(servos.current[i], '+.2f')} A", f"{number(servos.voltage[i], '.1f')}"
+        angle = f"{number(math.degrees(servos.position[i]), '+z.1f')}°"
+        current, volts = f"{number(servos.current[i], '+z.2f')} A", f"{number(servos.voltage[i], 'z.1f')}"
         error = f" ✗{servos.error[i]:#04x}" if servos.error[i] else " warm" if hot is T.WARN else " hot"
         lines.append(
             (
-                (f"{name.replace('theta_', 'theta '):<9}", T.LABEL),
+                (f"{name.replace('theta_', 'theta '):<8}", T.LABEL),
                 device(f"{angle:>7}{current:>8}{volts:>6}"),
-                device(f"{number(servos.temperature[i], '.0f') + '°C':>6}", hot),
+                device(f"{number(servos.temperature[i], 'z.0f') + '°C':>6}", hot),
                 device(error if servos.error[i] or hot is not T.PLAIN else "", T.BAD if servos.error[i] else hot),
             )
         )
@@ -322,7 +322,7 @@ def _tip(view: View) -> Iterator[Span]:
         return
     estimate = view.tick.outputs.estimate
     off = clearance(estimate.tip_W, view.known.pipe)
-    words = f"{number(1000 * off, '.1f')} mm" if abs(off) < 0.1 else f"{number(off, '.2f')} m"
+    words = f"{number(1000 * off, 'z.1f')} mm" if abs(off) < 0.1 else f"{number(off, 'z.2f')} m"
     yield f"{words} from the pipe", T.STRONG if off <= _NEAR else T.PLAIN
 
 
@@ -344,7 +344,7 @@ def _sentence(view: View, code: str) -> str:
 
 def _answer(order: Order, now_ns: int) -> Span:
     age = duration((now_ns - order.asked_ns) * 1e-9)
-    text = order.text.removesuffix(".")
+    text = order.text.removeprefix(f"{order.name} refused. ").removesuffix(".")
     match order.outcome:
         case None if order.pending:
             return f"… {order.name} asked {age} ago", T.WARN

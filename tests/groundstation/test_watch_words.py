@@ -196,7 +196,7 @@ def test_servos_that_are_hot_or_have_an_error_or_no_torque(puppet: Puppet, eye: 
     assert lines[1].endswith("64°C warm")
     assert lines[2].endswith("71°C hot")
     assert "--" in lines[4]
-    assert all(len(line) <= 42 for line in (title, *lines))
+    assert all(len(line) <= 41 for line in (title, *lines))
 
 
 @pytest.mark.parametrize(("ahead", "said"), [(0.0004, "0.4 mm"), (0.05, "50.0 mm"), (0.72, "0.72 m")])
@@ -256,6 +256,7 @@ def test_the_newest_events_that_fit(puppet: Puppet, eye: Eye) -> None:
 def test_what_became_of_orders() -> None:
     orders = [
         Order("hold", START, Outcome.REFUSED, "Nobody commands: take the lease first."),
+        Order("resume", START, Outcome.REFUSED, "resume refused. Nothing was interrupted."),
         Order("stop", START, Outcome.DONE, "Holding."),
         Order("retreat", START),
         Order("land", START, None, "falcon has gone: no answer within 5 s"),
@@ -263,6 +264,7 @@ def test_what_became_of_orders() -> None:
     lines = [text(words.answers([order], START + 2 * S, 100, 2)) for order in orders]
     assert lines == [
         "✗ hold refused, 2.0 s ago: Nobody commands: take the lease first",
+        "✗ resume refused, 2.0 s ago: Nothing was interrupted",
         "✓ stop done, 2.0 s ago: Holding",
         "… retreat asked 2.0 s ago",
         "? land asked 2.0 s ago: falcon has gone: no answer within 5 s",
@@ -340,6 +342,7 @@ def test_ages_are_bounds(seconds: float, said: str) -> None:
 
 
 def test_what_is_no_number() -> None:
+    assert number(-0.001, "z.2f") == "0.00"
     assert number(math.nan, ".1f") == "--"
 
 

@@ -81,6 +81,10 @@ class Puppet:
             inputs = replace(self.tick.inputs, t_ns=sent, dt=self.dt)
             self._telemetry = Telemetry(sent, replace(self.tick, index=self._index, inputs=inputs))
 
+    def stall(self, seconds: float) -> None:
+        """The loop makes no tick for so long; nobody looks meanwhile."""
+        self.now_ns += round(seconds * S)
+
     def tell(self, code: str, text: str, severity: Severity = Severity.INFO) -> Told:
         """An event now."""
         told = Told(len(self.events) + 1, Event(self.now_ns - BEHIND, code, severity, text))
