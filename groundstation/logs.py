@@ -23,8 +23,11 @@ from onboard.wire import ListLogs, LogFile, ReadLog
 if TYPE_CHECKING:
     from groundstation.client import Client
 
-#: Bytes asked for at once; the vehicle takes a view order 20 times a second, and drops what comes faster.
-PIECE, _PACE = 256 * 1024, 1.0 / 18.0
+#: Most, first and fewest bytes asked for at once. Pieces are such that each takes no longer than this, s: it holds up
+#: other answers of the vehicle, and what takes longer than 0.25 s would be asked for again.
+PIECE, _FIRST, _LEAST, _SLOW = 256 * 1024, 16 * 1024, 2 * 1024, 0.15
+#: The vehicle takes a view order 20 times a second, and drops what comes faster, s.
+_PACE: Final = 1.0 / 16.0
 #: For the vehicle to make the sum of a log: so long, and so fast, s and bytes/s.
 _PATIENCE, _SUMMED = 30.0, 5e6
 _LOOK: Final = 0.25
@@ -222,11 +225,13 @@ def _fill(client: Client, options: argparse.Namespace, file: LogFile, copy: _Cop
 def _take(client: Client, options: argparse.Namespace, file: LogFile, copy: _Copy, told: Told) -> None:
     """Read on to the end of the log, and at least once: the vehicle makes the sum of what is read."""
     told(copy.size, file.size)
-    first = True
+    first, most = True, _FIRST
     while first or copy.size < file.size:
         begun = time.monotonic()
-        size = max(1, min(PIECE, file.size - copy.size))
+        size = max(1, min(most, file.size - copy.size))
         piece = station.ask(client, ReadLog(file.name, copy.size, size), options).data
+        took = time.monotonic() - begun
+        most = max(_LEAST, most // 2) if took > _SLOW else min(PIECE, 2 * most) if took < 0.7 * _SLOW else most
         if copy.size < file.size:
             if not 0 < len(piece) <= size:
                 raise station.UnfinishedError(
@@ -236,7 +241,7 @@ def _take(client: Client, options: argparse.Namespace, file: LogFile, copy: _Cop
             told(copy.size, file.size)
         first = False
         if copy.size < file.size:
-            time.sleep(max(0.0, _PACE - (time.monotonic() - begun)))
+            time.sleep(max(0.0, _PACE - took))
 
 
 def _again(client: Client, options: argparse.Namespace, file: LogFile, until: float) -> LogFile:

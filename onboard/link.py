@@ -230,14 +230,15 @@ class Link:
                     f"Too old: {station} had last heard the vehicle {since} when it sent this; "
                     f"at most {self._settings.order_age:g} s are allowed."
                 )
-            if way is Way.COMMAND:
-                ack = self._rule(asked, now, heard)
-            elif isinstance(asked.ask, ShowEvents):
-                ack = asked.done(data=msgspec.json.encode(self._recent))
-            else:
-                ack = self._on_order(asked)
-            self._answered.put(station, ack)
-            return ack
+            if isinstance(asked.ask, ShowEvents):
+                return asked.done(data=msgspec.json.encode(self._recent))
+            if way is not Way.VIEW:
+                ack = self._rule(asked, now, heard) if way is Way.COMMAND else self._on_order(asked)
+                self._answered.put(station, ack)
+                return ack
+        # A look changes nothing, so its answer need not be remembered; and it may have to wait for a disk, which must
+        # hold up nobody who asks to stop.
+        return self._on_order(asked)
 
     def _rule(self, asked: Asked, now: int, heard: int) -> Ack:
         """What the commander may do, and who is to be it."""

@@ -15,6 +15,6 @@ class LogSettings(Struct, frozen=True, forbid_unknown_fields=True):
     """How much of the disk logs may take."""
 
     budget: Annotated[
-        float, _meta("GB", 0.0, 1e5, "all runs beside this one, then the oldest are removed at the start; 0: never")
+        float, _meta("GB", 0.0, 1e5, "of all runs in one folder; beyond it the oldest are removed; 0: none ever is")
     ] = 0.0
     free: Annotated[float, _meta("GB", 0.0, 1e5, "free disk space that preflight wants")] = 0.5

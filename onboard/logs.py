@@ -92,16 +92,17 @@ class Logs:
             raise NotShownError(f"{name!r} cannot be read: {error.strerror}.") from None
 
     def prune(self, budget: float) -> tuple[str, ...]:
-        """Remove the oldest runs until all beside the one being written take ``budget`` bytes at most; 0: none.
+        """Remove the oldest runs until all take ``budget`` bytes at most, with the one being written; 0: none.
 
-        The newest ``KEPT`` stay, and what holds files that are not Pipewright's. Gives a sentence for each run that was
-        removed, or should have been.
+        That one, the newest ``KEPT`` of the others, and what holds files that are not Pipewright's stay. Gives a
+        sentence for each run that was removed, or should have been.
         """
         if not budget:
             return ()
-        runs = [(run, self._size(run)) for run in self._runs() if run.name != self._writing]
+        runs = [(run, self._size(run)) for run in self._runs()]
         total, told = sum(size for _, size in runs), []
-        for run, size in reversed(runs[KEPT:]):
+        finished = [(run, size) for run, size in runs if run.name != self._writing]
+        for run, size in reversed(finished[KEPT:]):
             if total <= budget:
                 break
             try:

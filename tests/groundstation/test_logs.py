@@ -16,6 +16,7 @@ from onboard.logs import Logs
 from onboard.wire import ListLogs, LogFile, ReadLog
 from tests.groundstation.vehicle import run, showing
 from tests.onboard.relay import Relay
+from tests.waiting import pause
 
 CONTENT = bytes(range(256)) * 4096 + b"the end"
 NAME = "desk-007/log.mcap"
@@ -106,12 +107,30 @@ def test_it_goes_on_where_it_was_cut(
         code = fetch(NAME, "--timeout", "2", port=relay.port)
     assert code in (codes.TIMED_OUT, codes.NOT_THERE)
     assert "the same command goes on there" in capsys.readouterr().err
-    assert here(tmp_path) == {f"{NAME}.part": CONTENT[: logs.PIECE]}
+    first = vessel.reads[0].size
+    assert here(tmp_path) == {f"{NAME}.part": CONTENT[:first]}
     vessel.on_read = lambda ask, piece: piece
     vessel.reads.clear()
     assert fetch() == codes.DONE
-    assert vessel.reads[0].offset == logs.PIECE
+    assert vessel.reads[0].offset == first
     assert here(tmp_path) == {NAME: CONTENT}
+
+
+def test_pieces_are_as_large_as_the_link_takes_quickly(vessel: Vessel, fetch: Fetch) -> None:
+    """A slow link is not held up: the answer to a stop travels behind a piece."""
+    vessel.log.write_bytes(CONTENT * 4)
+    assert fetch() == codes.DONE
+    assert 4 * vessel.reads[0].size <= max(ask.size for ask in vessel.reads) <= logs.PIECE
+    vessel.log.write_bytes(CONTENT[:100_000])
+    vessel.reads.clear()
+
+    def slow(ask: ReadLog, piece: bytes) -> bytes:
+        pause(2e-5 * len(piece))
+        return piece
+
+    vessel.on_read = slow
+    assert fetch(NAME, "--out", str(vessel.folder.parent / "slowly")) == codes.DONE
+    assert max(ask.size for ask in vessel.reads[3:]) <= 8 * 1024
 
 
 def test_a_damaged_piece_is_found_out(
@@ -151,7 +170,9 @@ def test_a_piece_that_is_too_short_or_too_long(
 ) -> None:
     vessel.on_read = lambda ask, piece: piece + b"!"
     assert fetch() == codes.REFUSED
-    assert f"gave {logs.PIECE + 1} bytes where {logs.PIECE} were asked for" in capsys.readouterr().err
+    assert (
+        f"gave {vessel.reads[0].size + 1} bytes where {vessel.reads[0].size} were asked for" in capsys.readouterr().err
+    )
     vessel.on_read = lambda ask, piece: b""
     assert fetch() == codes.REFUSED
     assert "gave 0 bytes" in capsys.readouterr().err
@@ -198,7 +219,7 @@ def test_a_log_that_goes_away_meanwhile(
     vessel.on_read = gone
     assert fetch() == codes.REFUSED
     assert "not there, or not any more" in capsys.readouterr().err
-    assert here(tmp_path) == {f"{NAME}.part": CONTENT[: logs.PIECE]}
+    assert here(tmp_path) == {f"{NAME}.part": CONTENT[: vessel.reads[0].size]}
 
 
 @pytest.mark.parametrize("name", ["desk-08", "../runs/desk-007/log.mcap", "", "/etc/passwd"])

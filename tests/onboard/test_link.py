@@ -233,6 +233,29 @@ def test_stop_is_answered_while_telemetry_and_events_are_stuck(
         gate.set()
 
 
+def test_stop_is_answered_while_a_look_waits_for_a_disk(vehicle: Vehicle, join: Callable[..., Client]) -> None:
+    looked, there = threading.Event(), threading.Event()
+
+    def answer(asked: Asked) -> Ack:
+        if isinstance(asked.ask, ShowParams):
+            looked.set()
+            there.wait(LONG)
+        return asked.done()
+
+    vehicle.answer = answer
+    viewer, operator = join("viewer"), join("operator")
+    looking = threading.Thread(target=viewer.ask, args=(ShowParams(),), kwargs={"timeout": LONG})
+    looking.start()
+    try:
+        assert looked.wait(LONG)
+        assert operator.ask(Stop(), timeout=LONG).outcome is Outcome.DONE
+        assert operator.ask(TakeLease(), timeout=LONG).outcome is Outcome.DONE
+        assert not there.is_set()
+    finally:
+        there.set()
+        looking.join()
+
+
 def test_ages_both_ways_and_the_clocks(vehicle: Vehicle, join: Callable[..., Client]) -> None:
     alice = join("alice")
     assert alice.ask(TakeLease()).outcome is Outcome.DONE
