@@ -84,7 +84,7 @@ class Punctuality(Struct, frozen=True):
     rate: float = math.nan
     """Hz; of all ticks, also of those between."""
     worst: float = math.nan
-    """Longest time from one tick to the next, s: of ticks that came, and of a stall between two that was not caught up."""
+    """Longest time from one tick to the next, s: of ticks that came, or of a stall that was not caught up."""
 
 
 class View(Struct, frozen=True):

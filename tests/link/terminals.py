@@ -83,7 +83,8 @@ class Running:
             while not found():
                 left = until - time.monotonic()
                 assert left > 0.0, f"not within {patience:g} s: {what}"
-                assert self.process.poll() is None or any(t.is_alive() for t in self._listeners), f"ended before: {what}"
+                listening = any(listener.is_alive() for listener in self._listeners)
+                assert listening or self.process.poll() is None, f"ended before: {what}"
                 self._news.wait(min(left, 0.2))
 
     def says(self, words: str, since: int = 0, patience: float = PATIENCE) -> None:
