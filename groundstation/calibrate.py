@@ -53,7 +53,7 @@ def add_parser(commands: Any) -> None:
     servos.add_argument("--then", type=float, nargs=5, metavar=_NAMES, help="of a second pose, deg: find the signs too")
     bus = servos.add_argument_group("the bus (default: as --config says)")
     bus.add_argument("--port", help="serial port, like /dev/servos")
-    bus.add_argument("--baud", type=int, choices=BAUDS, metavar="N")
+    bus.add_argument("--baud", type=int, choices=BAUDS, metavar="N", help="of the bus (default: as configured)")
     bus.add_argument("--ids", type=int, nargs=5, metavar=_NAMES, help="of the servos")
     bus.add_argument("--signs", type=int, nargs=5, choices=(1, -1), metavar=_NAMES)
     words = "where the camera sits and how it is turned, from the log of a motion"
