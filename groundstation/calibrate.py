@@ -55,7 +55,9 @@ def add_parser(commands: Any) -> None:
     bus.add_argument("--port", help="serial port, like /dev/servos")
     bus.add_argument("--baud", type=int, choices=BAUDS, metavar="N", help="of the bus (default: as configured)")
     bus.add_argument("--ids", type=int, nargs=5, metavar=_NAMES, help="of the servos")
-    bus.add_argument("--signs", type=int, nargs=5, choices=(1, -1), metavar=_NAMES)
+    bus.add_argument(
+        "--signs", type=int, nargs=5, choices=(1, -1), metavar=_NAMES, help="of the servos (default: as configured)"
+    )
     words = "where the camera sits and how it is turned, from the log of a motion"
     mount = _add(kinds, "mount", words, _MOUNT_EPILOG)
     for parser in (hover, mount):
