@@ -61,6 +61,7 @@ class Emergency:
         """When that began to be wanted."""
         self._stopped_ns: int | None = None
         """When a stop was asked for that the loop has not taken yet."""
+        self._instead: Callable[[str], None] | None = None
         self._limp = False
         self._troubled = False
         self._confirmed = False
@@ -94,10 +95,14 @@ class Emergency:
         if new:
             self._teller.tell(Level.WARNING, "killed: the motors and the servos' torque are cut until a reset.")
 
-    def stop(self, done: Done | None = None) -> None:
-        """Ask the loop to stop; if it is stuck, now or a moment later, the autopilot lands by itself."""
+    def stop(self, done: Done | None = None, instead: Callable[[str], None] | None = None) -> None:
+        """Ask the loop to stop; if it is stuck, now or a moment later, the autopilot lands by itself.
+
+        done: called by the loop with what came of the tick that took the request. instead: called with a sentence when
+        the autopilot is told to land in the place of a loop that is stuck.
+        """
         with self._changing:
-            self._stopped_ns = self._clock()
+            self._stopped_ns, self._instead = self._clock(), instead
         self._guarded("the loop", partial(self._request, Request.STOP, done=done))
         self._look()
         self._wake.set()
@@ -145,7 +150,10 @@ class Emergency:
             elif now - ticked_ns >= STUCK_NS and self._flies_on() and self._want(Engage.LAND, instead_of=(None,)):
                 self._insist()
                 silent = f"for {(now - ticked_ns) * 1e-9:.2f} s" if ticked_ns else "yet"
-                self._teller.tell(Level.ERROR, f"the loop has made no tick {silent}: the autopilot is told to land.")
+                text = f"the loop has made no tick {silent}: the autopilot is told to land."
+                self._teller.tell(Level.ERROR, text)
+                if (instead := self._instead) is not None:
+                    instead(text[0].upper() + text[1:])
         if ticked_ns > self._since_ns and self._want(None, instead_of=(Engage.LAND,)):
             self._insist()
             self._teller.tell(Level.WARNING, "the loop ticks again.")

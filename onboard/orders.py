@@ -54,9 +54,11 @@ class _Reloader(Protocol):
 
 
 class _Emergency(Protocol):
-    def stop(self, done: Callable[[Outputs], None] | None = None) -> None: ...
+    def stop(
+        self, done: Callable[[Outputs], None] | None = None, instead: Callable[[str], None] | None = None
+    ) -> None: ...
 
-    def kill(self, done: Callable[[Outputs], None] | None = None) -> None: ...
+    def kill(self) -> None: ...
 
 
 Settle = Callable[[Asked, Ack], None]
@@ -88,7 +90,7 @@ class Orders:
         changed = partial(self._changed, asked)
         match asked.ask:
             case Stop():
-                self._emergency.stop(answered)
+                self._emergency.stop(answered, lambda text: self._settle(asked, asked.done(text)))
             case Mission(request=Request.KILL):
                 self._emergency.kill()  # done, whatever the loop does; that the mission has seen it, an event tells
                 return asked.done("Killed: the motors and the servos' torque are cut until a reset.")

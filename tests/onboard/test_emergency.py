@@ -240,6 +240,16 @@ def test_a_stop_lands_at_once_for_a_loop_that_is_stuck(begin: Callable[..., Rig]
     assert rig.says("the loop has made no tick for 0.3")
 
 
+def test_who_stopped_is_told_of_the_landing(begin: Callable[..., Rig]) -> None:
+    told: list[str] = []
+    rig = begin()
+    rig.ticked_ns -= 2 * STUCK_NS
+    rig.emergency.stop(instead=told.append)
+    (text,) = told
+    assert text.startswith("The loop has made no tick for 0.3")
+    assert text.endswith("the autopilot is told to land.")
+
+
 def test_a_stop_lands_for_a_loop_that_gets_stuck_with_it(begin: Callable[..., Rig]) -> None:
     rig = begin()
     rig.tick()

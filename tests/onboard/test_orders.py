@@ -46,6 +46,7 @@ class House:
         self.params = load_config("paper")
         self.asked: list[tuple[Any, ...]] = []
         self.done: Callable[[Outputs], None] | None = None
+        self.instead: Callable[[str], None] | None = None
         self.changed: Done | None = None
         self.load: Callable[[], Params] | None = None
         self.settled: list[Ack] = []
@@ -64,11 +65,11 @@ class House:
         self.done = done
 
     # the emergency
-    def stop(self, done: Callable[[Outputs], None] | None = None) -> None:
+    def stop(self, done: Callable[[Outputs], None] | None = None, instead: Callable[[str], None] | None = None) -> None:
         self.asked.append(("stop",))
-        self.done = done
+        self.done, self.instead = done, instead
 
-    def kill(self, done: Callable[[Outputs], None] | None = None) -> None:
+    def kill(self) -> None:
         self.asked.append(("kill",))
 
     # the reloader
@@ -115,6 +116,13 @@ def test_it_is_handed_on_and_settled_by_the_tick_that_took_it(
     assert house.asked == [handed_on]
     assert house.settled == []
     assert house.tick(ALARM, HOVERING) == Ack("o1", Outcome.DONE, HOVERING.text)
+
+
+def test_a_stop_that_a_stuck_loop_does_not_take_is_settled_by_the_landing(house: House) -> None:
+    house.order(Stop())
+    assert house.instead is not None
+    house.instead("The autopilot is told to land.")
+    assert house.settled == [Ack("o1", Outcome.DONE, "The autopilot is told to land.")]
 
 
 def test_a_kill_is_done_whatever_the_loop_does(house: House) -> None:
