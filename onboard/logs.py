@@ -185,9 +185,12 @@ class Logs:
             os.close(log)
 
     def _size(self, run: _Run) -> int:
-        """Bytes of all files of a run."""
-        with os.scandir(self._folder / run.name) as entries:
-            return sum(entry.stat(follow_symlinks=False).st_size for entry in entries)
+        """Bytes of all files of a run; of one that cannot be looked into, those of its log."""
+        try:
+            with os.scandir(self._folder / run.name) as entries:
+                return sum(entry.stat(follow_symlinks=False).st_size for entry in entries)
+        except OSError:
+            return run.log.st_size
 
     def _remove(self, run: str) -> None:
         """Raises _ForeignError and OSError; the log goes last, so that what is left is still a run."""

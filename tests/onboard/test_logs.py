@@ -185,6 +185,20 @@ def test_a_disk_that_refuses_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert [text.endswith("cannot be removed: Permission denied.") for text in told] == [True, True, False]
 
 
+def test_a_run_that_somebody_else_takes_away_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for k in range(5):
+        a_run(tmp_path, f"desk-{k}", b"x" * 1000, age=1000.0 - k)
+    logs = Logs(tmp_path)
+    runs = logs._runs()
+    monkeypatch.setattr(logs, "_runs", lambda: runs)
+    for path in (tmp_path / "desk-0").iterdir():
+        path.unlink()
+    (tmp_path / "desk-0").rmdir()
+    told = logs.prune(100.0)
+    assert "desk-0 should make way for new logs, but cannot be removed: No such file" in told[0]
+    assert "desk-1 (0.00 GB) was removed" in told[1]
+
+
 def test_room_on_the_disk(tmp_path: Path) -> None:
     assert Logs(tmp_path).free() > 0
     with pytest.raises(FileNotFoundError):
