@@ -19,6 +19,7 @@ from typing import NoReturn
 from groundstation import (
     calibrate,
     completion,
+    estop,
     events,
     keys,
     lease,
@@ -150,7 +151,7 @@ def _parser() -> argparse.ArgumentParser:
     for command in (sim, desk, onboard):
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
-    for group in (status, watch, preflight, lease, orders, events, params, logs, calibrate, keys, completion):
+    for group in (status, watch, estop, preflight, lease, orders, events, params, logs, calibrate, keys, completion):
         group.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")

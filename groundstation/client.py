@@ -155,7 +155,8 @@ class Client:
     def close(self) -> None:
         """Leave; safe to call twice."""
         self._closing.set()
-        self._session.close()
+        with suppress(zenoh.ZError):  # a connection that stands still cannot say goodbye
+            self._session.close()
         if self._sender.is_alive():
             self._sender.join()
 

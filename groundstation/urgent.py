@@ -152,7 +152,8 @@ class Urgent:
             self._serve(session, only)
         finally:
             self._count(-1)
-            session.close()
+            with suppress(zenoh.ZError):  # a connection that stands still cannot say goodbye
+                session.close()
 
     def _needed(self, only: str) -> bool:
         """There may be more to send; with ``only``, of this order."""

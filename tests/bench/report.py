@@ -12,6 +12,7 @@ from msgspec import Struct
 from tests.bench.compare import Comparison
 from tests.bench.core import Core
 from tests.bench.desk import Desk
+from tests.bench.emergency.measure import Emergency
 from tests.bench.flight import Flight
 from tests.bench.lateness import Lateness
 from tests.bench.servos import ServoCycle
@@ -31,8 +32,9 @@ class Report(Struct, frozen=True):
     servos: tuple[ServoCycle, ...]
     setpoints: SetPoints
     lateness: Lateness
+    emergency: Emergency | None
     desk: Desk | None
-    """None when it was left out."""
+    """None when they were left out."""
 
 
 def conditions(config: str) -> dict[str, str]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from tests.bench.core import Part
 from tests.bench.desk import Desk
+from tests.bench.emergency.measure import Emergency
+from tests.bench.emergency.stations import PATIENCE
 from tests.bench.measure import Stat
 from tests.bench.report import TARGET_US, Report
 
@@ -16,6 +18,8 @@ def table(report: Report) -> str:
     """All of a report, section by section."""
     parts = (_conditions, _core, _flight, _comparisons, _real_time)
     lines = [line for part in parts for line in part(report)]
+    if report.emergency is not None:
+        lines += emergency_rows(report.emergency)
     return "\n".join(lines if report.desk is None else [*lines, *desk_rows(report.desk)])
 
 
@@ -115,6 +119,30 @@ def _real_time(report: Report) -> list[str]:
     lines.append(_line("  the call alone", points.call, f"{points.call.median / points.bare.median:>11.1f}"))
     lines.append(_line("bare timer, lateness", late.bare, f"{1.0:>11.1f}"))
     lines.append(_line("  the loop with the core", late.loop, f"{late.ratio:>11.1f}"))
+    return lines
+
+
+def emergency_rows(emergency: Emergency) -> list[str]:
+    """The section of the emergency stop, ms."""
+    lines = _head("Emergency stop", "median ms", "p99 ms", "worst ms", "trials")
+    for condition in emergency.conditions:
+        lines.append(f"{condition.name}")
+        for name, spread, target in (
+            ("  kill, to the autopilot", condition.kill, condition.kill_target),
+            ("  kill, to the servo bus", condition.limp, condition.kill_target),
+            ("  stop, to the autopilot", condition.stop, condition.stop_target),
+            ("  both, to the answer", condition.answer, None),
+            ("  raw put, one way", condition.put, None),
+            ("  raw get, there and back", condition.get, None),
+        ):
+            line = f"{name:<{_NAME}}{spread.median:>11.2f}{spread.p99:>11.2f}{spread.worst:>11.2f}{spread.count:>11}"
+            if target is not None:
+                line += f"   target {target:g}: {'met' if spread.p99 <= target else 'MISSED'}"
+            lines.append(line)
+            if spread.missing:
+                lines.append(f"    ({spread.missing} of them had no answer within {PATIENCE:g} s)")
+    if emergency.skipped:
+        lines.append(f"no lossy network here: {emergency.skipped}")
     return lines
 
 

@@ -67,13 +67,10 @@ class StationOptions(Struct, frozen=True):
     trials: int
     """Of each kind, all stations together."""
     stations: int = 1
-    connections: int = 3
-    """Of each station for what is urgent; 0: the one session of a client, which carries everything."""
     rest: tuple[float, float] = (0.01, 0.03)
     """Between two orders of a station, s: from, to."""
     keys: str = ""
     """Folder with a folder of keys for each station; empty: plain."""
-    seed: int = 0
 
 
 class Stations(Struct):

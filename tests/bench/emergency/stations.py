@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event, Thread
@@ -13,18 +13,18 @@ from threading import Event, Thread
 import msgspec
 import zenoh
 
-from groundstation.client import Client, NoAnswerError, StationSettings
-from groundstation.urgent import Urgent
+from groundstation.client import NoAnswerError, StationSettings
+from groundstation.urgent import CONNECTIONS, Urgent
 from onboard.admission import Security, station_security
 from onboard.core.types import Request
 from onboard.endpoints import NoVehicleError, open_session
 from onboard.identity import load_identity
-from onboard.wire import Ack, Ask, Mission, Stop
+from onboard.wire import Ask, Mission, Stop
 from tests.bench.emergency.messages import Kind, StationOptions, Stations, Trial
 from tests.bench.emergency.vehicle import LEASE, NAME, RAW_GET, RAW_PUT
 
 #: For an answer, and for a connection through a bad network, s.
-_PATIENCE, _CONNECTING = 10.0, 60.0
+PATIENCE, _CONNECTING = 10.0, 60.0
 _ASKS: dict[Kind, Ask] = {"kill": Mission(Request.KILL), "stop": Stop()}
 
 
@@ -47,14 +47,14 @@ def _station(options: StationOptions, number: int, noted: Stations) -> None:
         security = station_security(NAME, load_identity(Path(options.keys) / name))
         del security["access_control"]
     settings = StationSettings(NAME, (options.connect,), name, plain=not options.keys)
-    chance = random.Random(options.seed * 1000 + number)
+    chance = random.Random(number)
     pause = Event()
-    with _raw(settings, security) as raw, _asking(options, settings, security) as ask:
+    with _raw(settings, security) as raw, _asking(settings, security) as urgent:
         pause.wait(1.0)
         for turn in range(number, options.trials, options.stations):
             for kind in ("kill", "stop"):
                 pause.wait(chance.uniform(*options.rest))
-                noted.trials.append(_trial(ask, kind))
+                noted.trials.append(_trial(urgent, kind))
                 pause.wait(chance.uniform(*options.rest))
                 index = 2 * turn + (kind == "stop")
                 noted.puts[index] = time.monotonic_ns()
@@ -63,10 +63,10 @@ def _station(options: StationOptions, number: int, noted: Stations) -> None:
                     _get(raw, noted)
 
 
-def _trial(ask: Callable[[Ask], Ack], kind: Kind) -> Trial:
+def _trial(urgent: Urgent, kind: Kind) -> Trial:
     began = time.monotonic_ns()
     try:
-        name = ask(_ASKS[kind]).id
+        name = urgent.ask(_ASKS[kind], timeout=PATIENCE).id
     except (NoAnswerError, NoVehicleError):
         name = ""
     return Trial(kind, name, began, time.monotonic_ns())
@@ -74,7 +74,7 @@ def _trial(ask: Callable[[Ask], Ack], kind: Kind) -> Trial:
 
 def _get(raw: zenoh.Session, noted: Stations) -> None:
     began = time.monotonic_ns()
-    for _ in raw.get(RAW_GET, timeout=_PATIENCE, express=True, priority=zenoh.Priority.REAL_TIME):
+    for _ in raw.get(RAW_GET, timeout=PATIENCE, express=True, priority=zenoh.Priority.REAL_TIME):
         noted.gets.append(time.monotonic_ns() - began)
 
 
@@ -93,18 +93,12 @@ def _raw(settings: StationSettings, security: Security | None) -> Iterator[zenoh
 
 
 @contextmanager
-def _asking(
-    options: StationOptions, settings: StationSettings, security: Security | None
-) -> Iterator[Callable[[Ask], Ack]]:
-    if not options.connections:
-        with Client(settings, timeout=_CONNECTING, security=security) as client:
-            yield lambda ask: client.ask(ask, timeout=_PATIENCE)
-        return
-    with Urgent(settings, security=security, connections=options.connections) as urgent:
+def _asking(settings: StationSettings, security: Security | None) -> Iterator[Urgent]:
+    with Urgent(settings, security=security) as urgent:
         end = time.monotonic() + _CONNECTING
-        while urgent.connections < options.connections and time.monotonic() < end:
+        while urgent.connections < CONNECTIONS and time.monotonic() < end:
             time.sleep(0.05)
-        yield lambda ask: urgent.ask(ask, timeout=_PATIENCE)
+        yield urgent
 
 
 if __name__ == "__main__":

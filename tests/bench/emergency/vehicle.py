@@ -188,7 +188,7 @@ async def _loop(rig: Rig, link: Link, stuck: bool) -> None:
     while not over.is_set():
         rig.tick()
         link.tick(next(ticks))
-        if not listener.is_alive() and due - began > 1_000_000_000:
+        if listener.ident is None and due - began > 1_000_000_000:
             print("ready", flush=True)
             listener.start()
             while stuck and not over.is_set():
