@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
     # Imported here so that --help answers at once.
     from groundstation.watch_app import WatchApp
 
-    with station.open_client(options) as client:
+    with station.open_client(options, urgent=True) as client:
         app = WatchApp(client, lease=options.lease, timeout=options.timeout)
         app.run(mouse=False)  # so that the terminal still selects text, and nothing but keys comes in
         if (release := app.release()) is not None:
