@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 from math import inf
 from pathlib import Path
+from threading import Event as Flag
 from threading import Thread
 
 from msgspec import Struct
@@ -42,7 +43,7 @@ _SEVERITY = {Level.INFO: Severity.INFO, Level.WARNING: Severity.WARNING, Level.E
 LONGEST = 900.0
 _REPORT_NS = 1_000_000_000
 _JOIN = 2.0
-_GB = 1e9
+_GB, _PRUNE_PERIOD = 1e9, 600.0
 
 
 class Options(Struct, frozen=True):
@@ -110,6 +111,7 @@ class _Flight:
         self._stations: Stations | None = None
         self._shown: Shown | None = None
         self._lateness = Lateness()
+        self._over = Flag()
         self._sentences: deque[str] = deque()
         self.began = False
         self._ready = self._reload_first = False
@@ -177,6 +179,7 @@ class _Flight:
                     self._tell(Event(clock.now_ns(), "handed_over", Severity.WARNING, sentence))
             finally:
                 devices.on_look = None
+                self._over.set()
                 self._cpu.stop()
                 if self._stations is not None:
                     await asyncio.to_thread(self._stations.stop)
@@ -203,9 +206,11 @@ class _Flight:
             self._shown.tick = tick
 
     def _prune(self, logs: Logs, budget: float) -> None:
-        """Make room for logs, however long that takes."""
-        for sentence in logs.prune(budget * _GB):
-            self._sentences.append(sentence)
+        """Make room for logs, now and as this one grows, however long that takes."""
+        while True:
+            self._sentences.extend(logs.prune(budget * _GB))
+            if self._over.wait(_PRUNE_PERIOD):
+                return
 
     def _on_tick(self, outputs: Outputs) -> bool:
         now = self._clock.now_ns()
