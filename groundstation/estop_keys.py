@@ -4,15 +4,8 @@ from __future__ import annotations
 
 from enum import Enum, auto
 from math import inf
-from typing import Final
 
-#: The same key within this time is the key that repeats because it is held, not one that was pressed again.
-REPEATS: Final = 0.7
-#: A second k counts for so long.
-TWICE: Final = 2.0
-#: No keyboard begins to repeat a held key sooner than this, and all that do, repeat it faster than the other.
-_SOONEST: Final = 0.2
-_FASTER: Final = 0.12
+from groundstation.twice import REPEATS, Twice
 
 
 class Action(Enum):
@@ -24,17 +17,11 @@ class Action(Enum):
 
 
 class Keys:
-    """Space stops, k twice kills, q leaves.
-
-    A terminal tells no key's release, only that it repeats. A space bar that is held, or hit in panic, is one stop:
-    the second one lands. A k that is held, by whatever lies on the keyboard, does not kill: of two that are as far
-    apart as a key needs to begin to repeat, the second counts only when no third follows at once.
-    """
+    """Space stops, k twice kills, q leaves. A space bar that is held, or hit in panic, is one stop; another lands."""
 
     def __init__(self) -> None:
-        self._space = self._k = -inf
-        self._kill_at: float | None = None
-        self._held = False
+        self._space = -inf
+        self._kill = Twice()
 
     def press(self, key: str, t: float) -> Action | None:
         """A key has come."""
@@ -43,33 +30,18 @@ class Keys:
                 since, self._space = t - self._space, t
                 return Action.STOP if since > REPEATS else None
             case "k" | "K":
-                return self._kill(t)
+                return Action.KILL if self._kill.press(t) else None
             case "q" | "Q":
                 return Action.LEAVE
         return None
 
-    def _kill(self, t: float) -> Action | None:
-        since, self._k = t - self._k, t
-        if self._kill_at is not None:
-            self._kill_at, self._held = None, True
-        elif self._held:
-            self._held = since < REPEATS
-        elif since < _SOONEST:
-            return Action.KILL
-        elif since < TWICE:
-            self._kill_at = t + _FASTER
-        return None
-
     def due(self, t: float) -> Action | None:
         """What is to be done without another key."""
-        if self._kill_at is None or t < self._kill_at:
-            return None
-        self._kill_at, self._k = None, -inf
-        return Action.KILL
+        return Action.KILL if self._kill.due(t) else None
 
     def waits(self, t: float) -> bool:
         """Another k would kill."""
-        return not self._held and t - self._k < TWICE
+        return self._kill.left(t) > 0.0
 
     def land_next(self, t: float) -> bool:
         """Another space is a stop of its own by now."""

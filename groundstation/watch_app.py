@@ -15,6 +15,7 @@ from textual.events import Key
 
 from groundstation import watch_words as words
 from groundstation.client import Contact
+from groundstation.twice import FASTER
 from groundstation.watch_keys import QUIT, Hand, Leave
 from groundstation.watch_marks import Line
 from groundstation.watch_model import TREND, Model, View, gathered
@@ -172,10 +173,15 @@ class WatchApp(App[None]):
                 self.exit()
                 return
             case None:
-                pass
+                self.set_timer(1.1 * FASTER, self._kill_if_due)
             case order:
                 self._orders.give(order.name, order.ask)
         self.look()
+
+    def _kill_if_due(self) -> None:
+        if (order := self._hand.due(self._clock())) is not None:
+            self._orders.give(order.name, order.ask)
+            self.look()
 
     def _ring(self, before: View, view: View) -> None:
         """Once when the link is lost or the loop stops, and when safety begins to act."""

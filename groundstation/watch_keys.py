@@ -6,11 +6,10 @@ from typing import Final
 
 from msgspec import Struct
 
+from groundstation.twice import Twice
 from onboard.messages import Request
 from onboard.wire import Ask, Mission, Stop
 
-#: Kill is to be pressed again within this time, s.
-CONFIRM: Final = 2.0
 #: The same key again within this time is one that is held down, s.
 _HELD: Final = 0.4
 KILL, QUIT, YES = "k", "q", "y"
@@ -37,11 +36,14 @@ ORDERS: Final = {
 }
 
 
+_KILLS: Final = Order("kill", Mission(Request.KILL))
+
+
 class Hand:
     """Remembers what was pressed before."""
 
     def __init__(self) -> None:
-        self._kill_ns: int | None = None
+        self._kill = Twice()
         self._leaving = False
         self._last = ("", 0)
 
@@ -50,28 +52,26 @@ class Hand:
         key = key.lower() if len(key) == 1 else key
         held = key == self._last[0] and now_ns - self._last[1] < _HELD * 1e9
         self._last = (key, now_ns)
-        killing, leaving = self.killing(now_ns) > 0.0, self._leaving
-        self._kill_ns, self._leaving = None, False  # any other key is no to either question
+        leaving, self._leaving = self._leaving, False  # any other key is no to either question
         if key == KILL:
-            if killing:
-                return Order("kill", Mission(Request.KILL))
-            self._kill_ns = now_ns
-        elif key == QUIT:
+            return _KILLS if self._kill.press(now_ns * 1e-9) else None
+        self._kill.forget()
+        if key == QUIT:
             self._leaving = needed
             return None if needed else Leave()
-        elif key == YES and leaving:
+        if key == YES and leaving:
             return Leave()
-        elif not held:
+        if not held:
             return ORDERS.get(key)
         return None
 
-    def killing(self, now_ns: int) -> float:
-        """Time left to press kill again, s; 0: it was not pressed."""
-        return max(0.0, CONFIRM - (now_ns - self._kill_ns) * 1e-9) if self._kill_ns is not None else 0.0
+    def due(self, now_ns: int) -> Order | None:
+        """What is to be asked without another key: a kill whose second press was no repetition of the first."""
+        return _KILLS if self._kill.due(now_ns * 1e-9) else None
 
     def question(self, now_ns: int) -> str:
         """What is asked of the person; empty: nothing."""
-        if left := self.killing(now_ns):
+        if left := self._kill.left(now_ns * 1e-9):
             return f"KILL?  k again within {left:.1f} s cuts motors and servo torque: in the air it FALLS"
         if self._leaving:
             return "QUIT?  It flies, and you command it: without you it holds, then lands.  y quit   n stay"

@@ -8,7 +8,8 @@ from threading import Event, Lock
 import pytest
 
 from groundstation.client import NoAnswerError
-from groundstation.watch_keys import CONFIRM, ORDERS, Hand, Leave, Order
+from groundstation.twice import TWICE
+from groundstation.watch_keys import ORDERS, Hand, Leave, Order
 from groundstation.watch_orders import LeaseKeeper, Orders
 from groundstation.watch_shown import Shown, read_events, read_known
 from onboard.config import dump_config, load_config
@@ -28,6 +29,9 @@ class Person:
 
     def __call__(self, key: str, t: float, *, needed: bool = False) -> Order | Leave | None:
         return self.hand.press(key, START + round(t * S), needed=needed)
+
+    def due(self, t: float) -> Order | None:
+        return self.hand.due(START + round(t * S))
 
     def question(self, t: float) -> str:
         return self.hand.question(START + round(t * S))
@@ -57,7 +61,7 @@ def test_capitals_are_the_same_keys(press: Person) -> None:
     """Caps lock must not cost a stop."""
     assert press("S", 0.0) == Order("stop", Stop())
     assert press("K", 1.0) is None
-    assert press("K", 2.0) == KILL
+    assert press("K", 1.1) == KILL
 
 
 def test_other_keys_do_nothing(press: Person) -> None:
@@ -69,16 +73,30 @@ def test_other_keys_do_nothing(press: Person) -> None:
 def test_kill_takes_two_presses(press: Person) -> None:
     assert press("k", 0.0) is None
     assert press.question(0.5).startswith("KILL?  k again within 1.5 s")
-    assert press("k", 1.9) == KILL
-    assert press.question(1.9) == ""
+    assert press("k", 1.8) is None
+    assert press.due(1.85) is None
+    assert press.due(1.95) == KILL
+    assert press.question(1.95) == ""
     assert press("k", 2.0) is None  # a third is the first of the next
+
+
+def test_a_fast_double_press_kills_with_the_second(press: Person) -> None:
+    press("k", 0.0)
+    assert press("k", 0.15) == KILL
+
+
+def test_a_key_that_is_held_does_not_kill(press: Person) -> None:
+    for i in range(40):
+        t = 0.0 if i == 0 else 0.5 + 0.033 * (i - 1)
+        assert press("k", t) is None
+        assert press.due(t + 0.03) is None
 
 
 def test_a_second_press_that_comes_too_late_is_a_first(press: Person) -> None:
     press("k", 0.0)
-    assert press.question(CONFIRM) == ""
-    assert press("k", CONFIRM + 0.1) is None
-    assert press("k", CONFIRM + 0.2) == KILL
+    assert press.question(TWICE) == ""
+    assert press("k", TWICE + 0.1) is None
+    assert press("k", TWICE + 0.2) == KILL
 
 
 @pytest.mark.parametrize("key", ["h", "s", "x", "escape", "q"])
