@@ -140,11 +140,12 @@ def _urgently(options: argparse.Namespace, printer: Printer, order: _Order, ask:
         if options.order == "kill" and not options.now:
             _confirm(urgent.vehicle)
         text = station.ask(urgent, ask, options).text or f"{options.order}: done"
-    if not options.wait:
-        station.tell(options, text)
-        return codes.DONE
-    if not options.json:
-        print(text, flush=True)
+        # Told before the connections are closed, which may take its time where the network is bad.
+        if not options.wait:
+            station.tell(options, text)
+            return codes.DONE
+        if not options.json:
+            print(text, flush=True)
     with station.open_client(options, on_told=printer.hear) as client:
         return _wait(client, options, printer, order)
 

@@ -35,7 +35,7 @@ LOSS, DELAY = 0.2, 0.2
 _SOON: Final = (50.0, 100.0)
 _THROUGH_LOSS: Final = (1000.0, 1000.0)
 #: Through the lossy network so many stations ask at once, so that it does not take an hour; each rests as long, s.
-_STATIONS, _REST = 16, (0.5, 1.5)
+_STATIONS, _REST = 12, (0.5, 1.0)
 _PORT = 7447
 _LONGEST = 3600.0
 
@@ -177,8 +177,14 @@ def _judge(
         at = bisect_left(arrivals, heard[order]) if order in heard else len(arrivals)
         return arrivals[at] if at < len(arrivals) else None
 
+    marks = sorted(frames.marks)
+
     def stopped(order: str) -> int | None:
-        return first(frames.lands, order) if stuck else frames.marks.get(vehicle.marks.get(order, -1))
+        """Of two stops that were taken together, the set-points bear the later mark."""
+        if stuck:
+            return first(frames.lands, order)
+        at = bisect_left(marks, vehicle.marks.get(order, len(heard) + 1))
+        return frames.marks[marks[at]] if at < len(marks) else None
 
     return Condition(
         name,

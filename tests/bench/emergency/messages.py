@@ -67,7 +67,7 @@ class StationOptions(Struct, frozen=True):
     trials: int
     """Of each kind, all stations together."""
     stations: int = 1
-    rest: tuple[float, float] = (0.01, 0.03)
+    rest: tuple[float, float] = (0.04, 0.06)
     """Between two orders of a station, s: from, to."""
     keys: str = ""
     """Folder with a folder of keys for each station; empty: plain."""
@@ -79,5 +79,5 @@ class Stations(Struct):
     trials: list[Trial]
     puts: dict[int, int]
     """When the raw message of this number was put."""
-    gets: list[int]
-    """How long raw queries took, ns."""
+    gets: list[int | None]
+    """How long raw queries took, ns; None: no reply."""

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import cycle
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from threading import Event, Thread
 from typing import Any, cast
 
@@ -55,8 +55,8 @@ RAW_PUT, RAW_GET = f"pipewright/{NAME}/raw/put", f"pipewright/{NAME}/raw/get"
 #: Of the link, s: with the default of 2 s a connection through a bad network is given up again and again.
 LEASE = 10.0
 _PERIOD_NS = 4_000_000
-#: After an order, until all is as before it, s.
-_RENEWED = 0.005
+#: After the last order, until all is as before it, s.
+_RENEWED = 0.03
 _LIGHT = AutopilotCommand(
     Engage.OFFBOARD, Interface.BODY_RATE, 5.0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 )
@@ -118,7 +118,9 @@ class Rig:
         """As if it had never been asked."""
         while True:
             self._used.get()
-            time.sleep(_RENEWED)
+            with suppress(Empty):
+                while True:
+                    self._used.get(timeout=_RENEWED)
             self._emergency.close()
             self._px4.insist(None)
             self._bus.insist(False)
