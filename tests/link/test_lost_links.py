@@ -120,9 +120,7 @@ class Link:
         self.relay.mend()
 
     def _press(self, flight: Flying) -> None:
-        flight.wait(
-            "press", lambda look: look.phase == Phase.PRESS and look.truth.contact_force > 1.2, 3 * PATIENCE
-        )
+        flight.wait("press", lambda look: look.phase == Phase.PRESS and look.truth.contact_force > 1.2, 3 * PATIENCE)
 
 
 @pytest.fixture(scope="module")
