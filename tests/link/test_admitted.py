@@ -85,7 +85,7 @@ def test_one_commands_another_seizes_and_anyone_stops(flown: Aviary) -> None:
     alice, bob, victor = flown["alice"], flown["bob"], flown["victor"]
     with Keeper(alice) as first:
         assert "alice commands" in bob("lease", "take", code=3).err
-        alice("takeoff", "--wait")
+        alice.insist("takeoff", "--wait")
         assert "alice commands, not bob" in bob("land", code=3).err
         with Keeper(bob, "--seize") as second:
             assert "bob has taken command" in first.running.end().err
@@ -102,8 +102,7 @@ def test_one_commands_another_seizes_and_anyone_stops(flown: Aviary) -> None:
 def test_a_flood_drops_no_stop_and_makes_no_tick_late(flown: Aviary) -> None:
     bob = flown["bob"]
     with Keeper(bob) as kept:
-        bob("preflight", "--wait=30")
-        bob("takeoff", "--wait")
+        bob.insist("takeoff", "--wait")
         with viewer(flown) as victor:
             began = time.monotonic_ns()
             pause(FLOOD)

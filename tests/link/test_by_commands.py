@@ -43,10 +43,10 @@ def test_a_repair_by_commands_alone(tmp_path: Path) -> None:
     file.write_text(CONFIG)
     with desk(tmp_path, config="mine.yaml") as flown:
         alice = flown.terminal("--station=alice")
-        assert all(row["ok"] for row in alice("preflight", "--wait=30").json["checks"])
+        assert all(row["ok"] for row in alice("preflight", "--wait=60").json["checks"])
         assert alice("arm", code=3).json["outcome"] == "refused", "nobody commands yet"
         with Keeper(alice) as kept:
-            alice("arm")
+            alice.insist("arm")
             kept.until("armed")
             alice("takeoff", "--wait")
 
