@@ -35,11 +35,12 @@ class Shown:
         """The newest."""
         self.statistics: Mapping[str, float] = {}
         """Of the newest device report."""
+        self._written: tuple[Config, bytes] | None = None
 
     def by_order(self) -> Shows:
         """What to call for which order."""
         return {
-            ShowParams: lambda _: dump_config(self._config).encode(),
+            ShowParams: lambda _: self._parameters(),
             ShowPreflight: lambda _: msgspec.json.encode(self._checks()),
             ListLogs: lambda _: msgspec.json.encode(self._logs.files()),
             ReadLog: lambda ask: self._logs.read(ask.name, ask.offset, ask.size),
@@ -48,6 +49,13 @@ class Shown:
     @property
     def _config(self) -> Config:
         return cast("Config", self._loop.params)
+
+    def _parameters(self) -> bytes:
+        """Written once for each set: that takes long, and whoever asks again and again must not make ticks late."""
+        config, written = self._config, self._written
+        if written is None or written[0] is not config:
+            written = self._written = (config, dump_config(config).encode())
+        return written[1]
 
     def _checks(self) -> tuple[Check, ...]:
         known = Known(
