@@ -32,8 +32,11 @@ from tests.waiting import LONG, pause
 pytestmark = REALTIME
 
 VEHICLE = "falcon"
-#: s, of the flood, and as long before it.
+#: s, of the flood; and of the calm before it.
 FLOOD = float(os.environ.get("PIPEWRIGHT_FLOOD", "10"))
+CALM = min(FLOOD, 60.0)
+#: A hover may last, and so may the battery.
+PATIENT = ("mission.hold_timeout=3600", "vehicle.battery.capacity=100")
 #: For a stop to be answered by the mission, in the flood, s.
 ANSWERED = 1.0
 #: A tick that comes this much later than without the flood is no matter of the flood, s: a sleep is not more exact.
@@ -64,7 +67,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Aviary]:
     Authority.init(folder / "others").add("mallory", Role.OPERATOR)
     keys = folder / "authority" / VEHICLE
     (keys / "roster.json").write_bytes((folder / "authority" / "roster.json").read_bytes())
-    with desk(folder, f"link.vehicle={VEHICLE}", f"link.keys={keys}", "devices.servos.kind=mock", tls=True) as waiting:
+    with desk(
+        folder, f"link.vehicle={VEHICLE}", f"link.keys={keys}", "devices.servos.kind=mock", *PATIENT, tls=True
+    ) as waiting:
         yield Aviary(waiting, folder)
 
 
@@ -105,7 +110,7 @@ def test_a_flood_drops_no_stop_and_makes_no_tick_late(flown: Aviary) -> None:
         bob.insist("takeoff", "--wait")
         with viewer(flown) as victor:
             began = time.monotonic_ns()
-            pause(FLOOD)
+            pause(CALM)
             with flood(flown) as flooder:
                 flooded = time.monotonic_ns()
                 pause(FLOOD)

@@ -39,9 +39,11 @@ WARM_UP = 10
 LEFT = 15_000
 #: How noisy the memory of a process is, bytes.
 NOISE = 1_500_000
-#: Brisk, and not high.
-SETS = ("plan.takeoff_height=0.5", "plan.speed=0.8", "plan.acceleration=0.8", "plan.jerk=2", "plan.descent_speed=0.4",
-        "link.peer_lease=2")  # fmt: skip
+#: Brisk, and not high; with a battery that lasts.
+SETS = (
+    "plan.takeoff_height=0.5", "plan.speed=0.8", "plan.acceleration=0.8", "plan.jerk=2", "plan.descent_speed=0.4",
+    "vehicle.battery.capacity=100", "vehicle.battery.hover_current=0.01",
+)  # fmt: skip
 
 #: What is waited for, in the ticks.
 Until = Callable[[Outputs], bool]
