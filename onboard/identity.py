@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import ssl
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -51,8 +52,7 @@ def load_identity(folder: Path) -> Identity:
     """
     ca, certificate, key = (folder / name for name in ("ca.pem", "cert.pem", "key.pem"))
     for path in (ca, certificate, key):
-        if not path.is_file():
-            raise IdentityError(f"{path}: is missing; copy the folder that `pipewright keys add` made, whole")
+        _readable(path)
     if key.stat().st_mode & 0o077:
         raise IdentityError(f"{key}: others may read it; make it private: chmod 600 {key}")
     told = _presented(ca, certificate, key)
@@ -63,6 +63,16 @@ def load_identity(folder: Path) -> Identity:
         return Identity(folder, subject["commonName"], Role(subject["organizationalUnitName"]), hosts, expires)
     except (KeyError, ValueError):
         raise IdentityError(f"{certificate}: has no name or role; make one with: pipewright keys add") from None
+
+
+def _readable(path: Path) -> None:
+    try:
+        path.open("rb").close()
+    except PermissionError:
+        remedy = f"folder and files must be its own: sudo chown -R {os.geteuid()} {path.parent}"
+        raise IdentityError(f"{path}: this user may not read it; {remedy}") from None
+    except OSError:
+        raise IdentityError(f"{path}: is missing; copy the folder that `pipewright keys add` made, whole") from None
 
 
 def _presented(ca: Path, certificate: Path, key: Path) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 #!/bin/sh
 # What a Jetson Nano still lacks to fly, each with its remedy. How it all gets there: docs/jetson.md.
-#   sh configs/jetson/check.sh [FOLDER]     FOLDER: look at another root than / (a mounted card; a test)
+#   sudo sh configs/jetson/check.sh [FOLDER]     FOLDER: look at another root than / (a mounted card; a test)
 # Exit code: 0 nothing lacks, 1 something does, 2 wrong arguments.
 set -u
 
@@ -31,6 +31,17 @@ here() { [ -e "$root$1" ] || [ -L "$root$1" ]; }
 absent() { ! here "$1"; }
 same() { cmp -s "$configs/$1" "$root$2"; }
 at_most() { [ "$(cat "$root$1")" -le "$2" ]; }
+# Each of these files is in the folder.
+holds_all() {
+    folder=$1
+    shift
+    for file; do here "$folder/$file" || return; done
+}
+# The folder and all in it are the service's own, and nobody else may read its private key. (No user yet: told above.)
+own() {
+    user=$(sed -n 's/^pipewright:[^:]*:\([0-9]*\):.*/\1/p' "$root/etc/passwd")
+    here "$1" && [ -z "$(find "$root$1" ! -uid "${user:-0}" ${user:+-print} -o -name key.pem -perm /077 -print)" ]
+}
 # A file of this name pattern, below a folder.
 found() { [ -n "$(find "$root$1" -name "$2" -print 2>/dev/null | head -n 1)" ]; }
 
@@ -96,6 +107,10 @@ check "a journal that outlives the battery" \
     same systemd/journald.conf /etc/systemd/journald.conf.d/pipewright.conf
 check "the vehicle's configuration" "see docs/jetson.md, The service; then what was measured: docs/devices.md" \
     here /etc/pipewright/vehicle.yaml
+check "the vehicle's keys" "ca.pem, cert.pem, key.pem and roster.json into /etc/pipewright/keys: docs/keys.md, What goes where" \
+    holds_all /etc/pipewright/keys ca.pem cert.pem key.pem roster.json
+check "keys that the service may read, and nobody else" \
+    "sudo chown -R pipewright: /etc/pipewright/keys && sudo chmod -R u=rwX,go= /etc/pipewright/keys" own /etc/pipewright/keys
 
 if [ "$lacking" -eq 0 ]; then
     echo "nothing lacks"

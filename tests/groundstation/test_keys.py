@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import os
 import stat
+import subprocess
+import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -268,6 +270,21 @@ def test_what_is_handed_out_is_checked_before_it_is_used(authority: Authority, t
     (alice / "ca.pem").unlink()
     with pytest.raises(IdentityError, match=r"alice/ca.pem: is missing; copy the folder"):
         load_identity(alice)
+
+
+@pytest.mark.parametrize("closed", ["alice", "alice/ca.pem", "alice/key.pem"])
+def test_keys_that_belong_to_another_user_are_told(authority: Authority, folder: Path, closed: str) -> None:
+    """As after ``sudo cp``: the service has a user of its own. Root may read anything, so a child drops that right."""
+    authority.add("alice", Role.OPERATOR)
+    (folder / closed).chmod(0)
+    ask = f"import onboard.identity as i, pathlib; i.load_identity(pathlib.Path({str(folder / 'alice')!r}))"
+    command = [sys.executable, "-c", ask]
+    if os.geteuid() == 0:
+        command = ["setpriv", "--bounding-set=-dac_override,-dac_read_search", "--", *command]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    told = folder / (closed if closed.endswith(".pem") else f"{closed}/ca.pem")
+    remedy = f"folder and files must be its own: sudo chown -R {os.geteuid()} {folder / 'alice'}"
+    assert done.stderr.endswith(f"{told}: this user may not read it; {remedy}\n")
 
 
 def test_a_certificate_outside_its_dates_is_told(folder: Path) -> None:

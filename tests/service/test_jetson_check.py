@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -51,7 +52,8 @@ def complete(root: Path, inner: str) -> None:
     ):
         write(root / inner / program)
     write(
-        root / "etc/passwd", "root:x:0:0::/root:/bin/sh\npipewright:x:997:997::/var/lib/pipewright:/usr/sbin/nologin\n"
+        root / "etc/passwd",
+        f"root:x:0:0::/root:/bin/sh\npipewright:x:{os.getuid()}:997::/var/lib/pipewright:/usr/sbin/nologin\n",
     )
     for source, target in (
         ("udev/99-servos.rules", "etc/udev/rules.d/99-servos.rules"),
@@ -64,6 +66,9 @@ def complete(root: Path, inner: str) -> None:
         (root / target).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(CONFIGS / source, root / target)
     link(root / "etc/systemd/system/multi-user.target.wants/pipewright.service", "../pipewright.service")
+    for name in ("ca.pem", "cert.pem", "key.pem", "roster.json"):
+        write(root / "etc/pipewright/keys" / name)
+        (root / "etc/pipewright/keys" / name).chmod(0o600)
 
 
 @pytest.fixture
@@ -131,12 +136,29 @@ def test_what_is_wrong_is_told_alone(jetpack: Path, path: str, content: str, wha
         ("srv/pipewright/usr/local/lib/librealsense2.so.2.53.1", "librealsense 2.53.1"),
         ("etc/systemd/system/multi-user.target.wants/pipewright.service", "beginning"),
         ("etc/pipewright/vehicle.yaml", "configuration"),
+        ("etc/pipewright/keys/key.pem", "the vehicle's keys"),
+        ("etc/pipewright/keys/roster.json", "the vehicle's keys"),
     ],
 )
 def test_what_is_missing_is_told_alone(jetpack: Path, path: str, what: str) -> None:
     (jetpack / path).unlink()
     (told,) = lacking(jetpack)
     assert what in told
+
+
+def test_a_private_key_that_others_may_read_is_told(jetpack: Path) -> None:
+    (jetpack / "etc/pipewright/keys/key.pem").chmod(0o640)
+    ((told, how),) = lacking(jetpack).items()
+    assert told.startswith("keys that the service may read")
+    assert "chmod" in how
+
+
+def test_keys_that_belong_to_another_user_are_told(jetpack: Path) -> None:
+    """As after ``sudo cp``."""
+    write(jetpack / "etc/passwd", f"pipewright:x:{os.getuid() + 1}:997::/var/lib/pipewright:/usr/sbin/nologin\n")
+    ((told, how),) = lacking(jetpack).items()
+    assert told.startswith("keys that the service may read")
+    assert "chown -R pipewright" in how
 
 
 def test_wrong_arguments(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
 from onboard.ending import PATIENCE
 
@@ -107,6 +108,14 @@ def test_the_configuration_of_the_vehicle_uses_these_names() -> None:
     named = set(re.findall(r"/dev/(\w+)", text))
     assert named == {"autopilot", "servos"}
     assert all(any(f'SYMLINK+="{name}"' in rule for rule in rules()) for name in named)
+
+
+def test_the_service_may_read_its_keys_and_not_change_them() -> None:
+    link = yaml.safe_load((ROOT / "configs/jetson.yaml").read_text("utf-8"))["link"]
+    unit = settings(UNIT)
+    assert unit["ReadOnlyPaths"] == [f"-{link['keys']}"]
+    assert unit["ReadWritePaths"] == [f"-{Path(link['keys']).parent}"], "saved parameters"
+    assert str(Path(link["keys"]).parent) in settings(JETPACK)["BindPaths"][0].split()
 
 
 def test_a_rule_is_made_of_known_keys() -> None:
