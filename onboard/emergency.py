@@ -103,9 +103,12 @@ class Emergency:
         """
         with self._changing:
             self._stopped_ns, self._instead = self._clock(), instead
+            lands = self._wanted is Engage.LAND
         self._guarded("the loop", partial(self._request, Request.STOP, done=done))
         self._look()
         self._wake.set()
+        if lands and self._wanted is Engage.LAND and instead is not None:
+            instead("The loop makes no tick: the autopilot was told to land already.")
 
     def release(self) -> None:
         """A kill is over, since the mission is back in preflight; to be called in any tick in which it is there.

@@ -259,6 +259,17 @@ def test_a_stop_lands_for_a_loop_that_gets_stuck_with_it(begin: Callable[..., Ri
     assert took > 0.9 * STUCK_NS * 1e-9
 
 
+def test_every_stop_that_a_stuck_loop_does_not_take_is_answered(begin: Callable[..., Rig]) -> None:
+    rig = begin()
+    answers: list[str] = []
+    rig.ticked_ns -= 2 * STUCK_NS
+    for _ in range(2):
+        rig.emergency.stop(instead=answers.append)
+    assert len(answers) == 2
+    assert "told to land" in answers[0]
+    assert "told to land already" in answers[1]
+
+
 def test_a_landing_is_said_again_until_it_lands(begin: Callable[..., Rig]) -> None:
     rig = begin(Autopilot(deaf=True))
     rig.emergency.stop()

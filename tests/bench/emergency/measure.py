@@ -35,7 +35,7 @@ LOSS, DELAY = 0.2, 0.2
 _SOON: Final = (50.0, 100.0)
 _THROUGH_LOSS: Final = (1000.0, 1000.0)
 #: Through the lossy network so many stations ask at once, so that it does not take an hour; each rests as long, s.
-_STATIONS, _REST = 12, (0.5, 1.0)
+_STATIONS, _REST = 8, (1.0, 2.0)
 _PORT = 7447
 _LONGEST = 3600.0
 
