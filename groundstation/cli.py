@@ -68,6 +68,8 @@ examples:
   pipewright onboard --config jetson --attended                waits on the ground for what it is asked
   pipewright onboard --config /etc/pipewright.yaml --mission --out /var/log/pipewright/today
 """
+#: Packages that a vehicle's computer does not need, and the extra that brings each.
+_EXTRAS = {"cryptography": "ground", "rich": "ground", "textual": "ground", "tqdm": "sim"}
 _LOG_HELP = "log.mcap of a run, or its run folder"
 
 
@@ -82,6 +84,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"pipewright: {error}", file=sys.stderr)
         return WRONG_INPUT
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in _EXTRAS:
+            raise
+        remedy = f"pip install 'pipewright[{_EXTRAS[package]}]'"
+        print(f"pipewright: this takes the package {package}, which is not installed: {remedy}", file=sys.stderr)
+        return BROKEN
     except BrokenPipeError:
         # Who read our output has seen enough; the interpreter must not complain of it at its end either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -13,6 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from groundstation import cli
+from groundstation.codes import BROKEN
 from onboard.core.types import Phase
 from tests.synthetic import change_outputs, mission, record
 
@@ -250,3 +251,12 @@ def test_interrupts_reach_the_flight_process_once(monkeypatch: pytest.MonkeyPatc
     os.close(write_end)
     assert code == 41
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_package_that_is_not_installed_is_named_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "rich", None)
+    monkeypatch.setitem(sys.modules, "rich.console", None)
+    assert cli.main(["report", str(tmp_path)]) == BROKEN
+    assert "pip install 'pipewright[ground]'" in capsys.readouterr().err
