@@ -31,9 +31,10 @@ _LEASE: Final = 10.0
 #: An order without an answer is sent again after this time, s, then after half as much more, up to ``AGAIN``. What
 #: follows a lost packet soon tells TCP of the loss, which otherwise only a timeout does.
 _SOON_AGAIN: Final = 0.04
-#: Then another connection is made for it beside those that there are: after a cut they may sleep on for as long as it
-#: was, and s.
+#: Then another connection is made beside those that there are, so many in all: after a cut they may sleep on for as
+#: long as it was; s. It is kept, since to close one that stands still can hold up the others.
 _SPARE: Final = 1.0
+_MOST: Final = 8
 #: One attempt to connect; a handshake with TLS may need that long where packets are lost, s.
 _ATTEMPT: Final = 5.0
 _REST: Final = 0.2
@@ -73,8 +74,8 @@ class Urgent:
         for _ in range(connections):
             self._add()
 
-    def _add(self, only: str = "") -> None:
-        lane = Thread(target=self._work, args=(only,), name="urgent", daemon=True)
+    def _add(self) -> None:
+        lane = Thread(target=self._work, name="urgent", daemon=True)
         self._lanes.append(lane)
         lane.start()
 
@@ -115,9 +116,9 @@ class Urgent:
         accepted, spare = False, time.monotonic() + _SPARE
         try:
             while self._wrong is None and (left := pending.end - time.monotonic()) > 0.0:
-                if self._open and not accepted and time.monotonic() > spare:
+                if self._open and not accepted and time.monotonic() > spare and len(self._lanes) < _MOST:
                     spare = pending.end
-                    self._add(order.id)
+                    self._add()
                 try:
                     answer = pending.answers.get(timeout=min(left, _REST))
                 except Empty:
@@ -143,25 +144,21 @@ class Urgent:
 
     # --- one connection, in a thread of its own, so that one that blocks keeps no other -------------------------------
 
-    def _work(self, only: str) -> None:
-        session = self._connect(only)
+    def _work(self) -> None:
+        session = self._connect()
         if session is None:
             return
         self._count(1)
         try:
-            self._serve(session, only)
+            self._serve(session)
         finally:
             self._count(-1)
             with suppress(zenoh.ZError):  # a connection that stands still cannot say goodbye
                 session.close()
 
-    def _needed(self, only: str) -> bool:
-        """There may be more to send; with ``only``, of this order."""
-        return not self._closing and (not only or only in self._orders)
-
-    def _connect(self, only: str) -> zenoh.Session | None:
+    def _connect(self) -> zenoh.Session | None:
         settings = self._settings
-        while self._needed(only):
+        while not self._closing:
             try:
                 return open_session(
                     "client",
@@ -178,7 +175,7 @@ class Urgent:
                 return None
         return None
 
-    def _serve(self, session: zenoh.Session, only: str) -> None:
+    def _serve(self, session: zenoh.Session) -> None:
         """Send what is pending, again and again, until it is answered."""
         due: dict[str, float] = {}
         pauses: dict[str, float] = {}
@@ -194,15 +191,15 @@ class Urgent:
                     due[name] = min(due[name], now + SOON)
                     self._changed.notify_all()
 
-        while (pending := self._next(due, pauses, only)) is not None:
+        while (pending := self._next(due, pauses)) is not None:
             left = max(pending.end - time.monotonic(), SOON)
             with suppress(zenoh.ZError):  # then it is sent again, here and elsewhere
                 send(session, self._key, pending.order, partial(answered, pending), left)
 
-    def _next(self, due: dict[str, float], pauses: dict[str, float], only: str) -> _Pending | None:
+    def _next(self, due: dict[str, float], pauses: dict[str, float]) -> _Pending | None:
         """Wait for what is to be sent next, and note when to send it again; None: no more."""
         with self._changed:
-            while self._needed(only):
+            while not self._closing:
                 for name in due.keys() - self._orders.keys():
                     del due[name], pauses[name]
                 now = time.monotonic()

@@ -90,7 +90,8 @@ def test_when_all_stand_still_another_is_made(patient: Vehicle) -> None:
         assert urgent.ask(KILL, timeout=LONG).outcome is Outcome.DONE
         assert time.monotonic() - began < 4.0
         assert len(patient.asked) == 1
-        seconds_until(lambda: urgent.connections == CONNECTIONS)
+        assert urgent.ask(Stop(), timeout=LONG).outcome is Outcome.DONE
+        assert urgent.connections == CONNECTIONS + 1
 
 
 def test_an_order_waits_for_no_other_connection(vehicle: Vehicle) -> None:

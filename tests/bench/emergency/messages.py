@@ -67,7 +67,7 @@ class StationOptions(Struct, frozen=True):
     trials: int
     """Of each kind, all stations together."""
     stations: int = 1
-    rest: tuple[float, float] = (0.04, 0.06)
+    rest: tuple[float, float] = (0.08, 0.12)
     """Between two orders of a station, s: from, to."""
     keys: str = ""
     """Folder with a folder of keys for each station; empty: plain."""

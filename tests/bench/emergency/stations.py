@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from threading import Event, Thread
+from threading import Barrier, Event, Thread
 
 import msgspec
 import zenoh
@@ -33,7 +33,9 @@ def main() -> None:
     """Ask, from all stations at once."""
     options = msgspec.json.decode(sys.argv[1], type=StationOptions)
     noted = Stations([], {}, [])
-    threads = [Thread(target=_station, args=(options, number, noted)) for number in range(options.stations)]
+    # Closing a session that stands still holds up the others of a process: none is closed before all are done.
+    done = Barrier(options.stations)
+    threads = [Thread(target=_station, args=(options, number, noted, done)) for number in range(options.stations)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -41,7 +43,7 @@ def main() -> None:
     print(msgspec.json.encode(noted).decode(), flush=True)
 
 
-def _station(options: StationOptions, number: int, noted: Stations) -> None:
+def _station(options: StationOptions, number: int, noted: Stations, done: Barrier) -> None:
     name = f"s{number}"
     security: Security | None = None
     if options.keys:
@@ -61,6 +63,7 @@ def _station(options: StationOptions, number: int, noted: Stations) -> None:
                 raw.put(RAW_PUT, str(index), express=True, priority=zenoh.Priority.REAL_TIME)
                 if index % 2:
                     _get(raw, noted)
+        done.wait()
 
 
 def _trial(urgent: Urgent, kind: Kind) -> Trial:

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from itertools import cycle
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import Any, cast
 
 import msgspec
@@ -56,7 +56,7 @@ RAW_PUT, RAW_GET = f"pipewright/{NAME}/raw/put", f"pipewright/{NAME}/raw/get"
 LEASE = 10.0
 _PERIOD_NS = 4_000_000
 #: After the last order, until all is as before it, s.
-_RENEWED = 0.03
+_RENEWED = 0.07
 _LIGHT = AutopilotCommand(
     Engage.OFFBOARD, Interface.BODY_RATE, 5.0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 )
@@ -90,6 +90,7 @@ class Rig:
         self._px4, self._bus = px4, bus
         self._requests: deque[tuple[Request, Done | None]] = deque()
         self._used: SimpleQueue[None] = SimpleQueue()
+        self._renewing = Lock()
         self._mark = 0
         self.ticked_ns = 0
         self.noted = Vehicle([], {}, {}, Frames())
@@ -107,10 +108,11 @@ class Rig:
     def hear(self, asked: Asked) -> Ack:
         """An order, on the link's thread."""
         self.noted.orders.append(Order(asked.id, time.monotonic_ns()))
-        if isinstance(asked.ask, Stop):
-            self._emergency.stop(lambda outputs: self.noted.marks.__setitem__(asked.id, self._mark))
-        else:
-            self._emergency.kill()
+        with self._renewing:
+            if isinstance(asked.ask, Stop):
+                self._emergency.stop(lambda outputs: self.noted.marks.__setitem__(asked.id, self._mark))
+            else:
+                self._emergency.kill()
         self._used.put(None)
         return asked.done()
 
@@ -121,10 +123,11 @@ class Rig:
             with suppress(Empty):
                 while True:
                     self._used.get(timeout=_RENEWED)
-            self._emergency.close()
-            self._px4.insist(None)
-            self._bus.insist(False)
-            self._emergency = self._new()
+            with self._renewing:
+                self._emergency.close()
+                self._px4.insist(None)
+                self._bus.insist(False)
+                self._emergency = self._new()
 
     def tick(self) -> None:
         """One cycle of the loop."""
