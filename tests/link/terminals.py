@@ -104,9 +104,9 @@ class Running:
 class Terminal:
     """Commands of one station."""
 
-    def __init__(self, folder: Path, *options: str) -> None:
+    def __init__(self, folder: Path, *options: str, timeout: float = TIMEOUT) -> None:
         """``options`` go to every command: who asks, and where."""
-        self._folder, self._options = folder, (*options, f"--timeout={TIMEOUT:g}", "--json")
+        self._folder, self._options = folder, (*options, f"--timeout={timeout:g}", "--json")
 
     def __call__(self, *arguments: str, code: int = 0) -> Said:
         """Run a command to its end, which must be this."""
@@ -174,9 +174,9 @@ class Desk:
         self.sets = sets
         self.log = folder / "runs" / "flight" / "log.mcap"
 
-    def terminal(self, *options: str) -> Terminal:
+    def terminal(self, *options: str, timeout: float = TIMEOUT) -> Terminal:
         """Another person."""
-        return Terminal(self.folder, f"--connect={self.endpoint}", *options)
+        return Terminal(self.folder, f"--connect={self.endpoint}", *options, timeout=timeout)
 
 
 @contextmanager

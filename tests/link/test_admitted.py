@@ -25,13 +25,15 @@ from onboard.logfile import LogReader
 from onboard.messages import Role
 from onboard.records import TICK, TIMING, Timing
 from onboard.wire import Outcome, Stop
-from tests.link.terminals import Desk, Keeper, Terminal, desk
+from tests.link.terminals import TIMEOUT, Desk, Keeper, Terminal, desk
 from tests.realtime import REALTIME
 from tests.waiting import LONG, pause
 
 pytestmark = REALTIME
 
 VEHICLE = "falcon"
+#: To look for a vehicle that is not shown, s.
+IN_VAIN = 3.0
 #: s, of the flood; and of the calm before it.
 FLOOD = float(os.environ.get("PIPEWRIGHT_FLOOD", "10"))
 CALM = min(FLOOD, 60.0)
@@ -54,7 +56,8 @@ class Aviary(Struct):
         return self.folder / ("others" if name == "mallory" else "authority") / name
 
     def __getitem__(self, name: str) -> Terminal:
-        return self.desk.terminal(f"--vehicle={VEHICLE}", f"--keys={self.keys(name)}")
+        timeout = IN_VAIN if name == "mallory" else TIMEOUT
+        return self.desk.terminal(f"--vehicle={VEHICLE}", f"--keys={self.keys(name)}", timeout=timeout)
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +81,7 @@ def test_who_is_not_admitted_sees_nothing_and_is_told_why(flown: Aviary) -> None
     assert "certificate" in wrong.err
     assert "phase" not in wrong.out
     plain = f"--connect={flown.desk.endpoint.replace('tls/', 'tcp/')}"
-    nothing = Terminal(flown.folder, plain, "--plain", f"--vehicle={VEHICLE}")("status", code=5)
+    nothing = Terminal(flown.folder, plain, "--plain", f"--vehicle={VEHICLE}", timeout=IN_VAIN)("status", code=5)
     assert "the vehicle wants certificates: connect to tls/" in nothing.err
     assert "phase" not in nothing.out
     assert flown["victor"]("status").json["phase"] == "preflight"

@@ -23,11 +23,11 @@ from tests.zenoh_sessions import free_port
 pytestmark = REALTIME
 
 #: After which silence the table holds and lands, s.
-SILENT, LOST = 1.5, 6.0
+SILENT, LOST = 1.2, 4.0
 #: Cuts, s: nothing comes of one, and a hold of the other.
-SHORT, LONGER = 0.9, 3.5
+SHORT, LONGER = 0.7, 2.5
 #: Nothing resumes by itself for so long after the link is back, s.
-AFTERWARDS = 2.0
+AFTERWARDS = 1.5
 
 
 class Link:
