@@ -3,7 +3,7 @@
 Each end is a process that is alone in a namespace with an interface ``air`` whose packets come to us, where they are
 carried to the other end, or not. No privileges are needed where users may have namespaces (``unshare -rn``).
 
-``python -m tests.lossy_network ADDRESS FD COMMAND...`` is what runs at an end; nobody else calls it.
+``python -m tests.lossy_network ADDRESS FD LINEAR COMMAND...`` is what runs at an end; nobody else calls it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from threading import Thread
 from types import TracebackType
 from typing import Any, Self
@@ -37,10 +38,12 @@ class UnavailableError(Exception):
 class LossyNetwork:
     """The wire between two ends. Use as a context manager.
 
-    loss: share of the packets that are lost, of each direction; delay: of the others, s, one way.
+    loss: share of the packets that are lost, of each direction; delay: of the others, s, one way. linear: as
+    configs/sysctl sets it, TCP does not double its timeout with each loss.
     """
 
-    def __init__(self, loss: float, delay: float, seed: int = 0) -> None:
+    def __init__(self, loss: float, delay: float, seed: int = 0, *, linear: bool = False) -> None:
+        self._linear = linear
         self._loss, self._delay = loss, delay
         self._random = random.Random(seed)
         self._taps: list[int] = []
@@ -69,7 +72,15 @@ class LossyNetwork:
         ours, theirs = socket.socketpair()
         with ours, theirs:
             address = ADDRESSES[len(self._taps)]
-            end = [sys.executable, "-m", "tests.lossy_network", address, str(theirs.fileno()), *command]
+            end = [
+                sys.executable,
+                "-m",
+                "tests.lossy_network",
+                address,
+                str(theirs.fileno()),
+                str(int(self._linear)),
+                *command,
+            ]
             try:
                 process = subprocess.Popen(["unshare", "-rn", *end], pass_fds=[theirs.fileno()], text=True, **how)
             except OSError as error:
@@ -114,12 +125,13 @@ class LossyNetwork:
                     self.lost += 1
 
 
-def _end(address: str, fd: int, command: Sequence[str]) -> None:
+def _end(address: str, fd: int, linear: str, command: Sequence[str]) -> None:
     """Make the interface of this namespace, hand it over, and become the command."""
     with socket.socket(fileno=fd) as peer:
         try:
             tap = os.open("/dev/net/tun", os.O_RDWR)
             fcntl.ioctl(tap, _TUNSETIFF, struct.pack("16sH22x", b"air", _IFF_TUN | _IFF_NO_PI))
+            Path("/proc/sys/net/ipv4/tcp_thin_linear_timeouts").write_text(linear, encoding="ascii")
             for words in ("link set lo up", f"addr add {address}/24 dev air", "link set air up"):
                 subprocess.run(["ip", *words.split()], check=True, capture_output=True, text=True)
         except OSError as error:
@@ -133,4 +145,4 @@ def _end(address: str, fd: int, command: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    _end(sys.argv[1], int(sys.argv[2]), sys.argv[3:])
+    _end(sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4:])

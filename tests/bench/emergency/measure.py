@@ -130,7 +130,7 @@ def _loopback(name: str, trials: int, *, stuck: bool = False) -> Condition:
 
 def _lossy(name: str, trials: int) -> Condition:
     """With TLS, since nothing else is allowed off loopback. Raises UnavailableError."""
-    with TemporaryDirectory() as folder, LossyNetwork(LOSS, DELAY) as network:
+    with TemporaryDirectory() as folder, LossyNetwork(LOSS, DELAY, linear=True) as network:
         keys = Path(folder) / "keys"
         authority = Authority.init(keys)
         authority.add(NAME, Role.VEHICLE, hosts=[ADDRESSES[0]])
