@@ -95,11 +95,15 @@ class Loop:
     def request(
         self, request: Request, *, go: Phase | None = None, done: Callable[[Outputs], None] | None = None
     ) -> None:
-        """Ask something of the mission; taken one a tick, in order; from any thread.
+        """Ask something of the mission; taken one a tick, in order, but kill and stop before all else; from any thread.
 
         go: where to, of a GO. done: called by the loop with what came of the tick that took the request.
         """
-        self._requests.append(_Asked(request, go, done))
+        asked = _Asked(request, go, done)
+        if request in (Request.KILL, Request.STOP):
+            self._requests.appendleft(asked)
+        else:
+            self._requests.append(asked)
 
     def reload(self, derived: Derived, *, grounded: bool, done: Callable[[int | None], None]) -> None:
         """Put another parameter set into force between two ticks; from any thread.

@@ -152,6 +152,16 @@ def test_requests_are_taken_one_a_tick_in_order(config: Config) -> None:
     assert refused == ["resume", "land", "resume", "hold"]
 
 
+@pytest.mark.parametrize("urgent", [Request.KILL, Request.STOP])
+def test_what_is_urgent_waits_for_no_other_request(config: Config, urgent: Request) -> None:
+    world, kept = world_of(config), Kept()
+    loop = Loop(mock_devices(world), VirtualClock(world.advance), config, kept)
+    for request in (Request.LAND, Request.HOLD, urgent):
+        loop.request(request)
+    asyncio.run(loop.run(lambda outputs: len(kept.ticks) < 3))
+    assert [tick.inputs.request for tick in kept.ticks] == [urgent, Request.LAND, Request.HOLD]
+
+
 class Logged:
     """A device that notes what is done with it."""
 
