@@ -13,6 +13,7 @@ from msgspec import Struct
 from drivers.samples import AutopilotState, FlightMode, Landed, Odometry, Quat, ServoState, Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.deviations import mass_of
 from sim_backend.knob import knob, switch
 
 T = TypeVar("T")
@@ -263,8 +264,7 @@ def _shake(x: Sequence[float]) -> Vec3:
 
 def hover_thrust(vehicle: Vehicle) -> float:
     """Thrust of one rotor in hover with the sleeve, N."""
-    mass = vehicle.base.mass + sum(part.mass for part in vehicle.arm.parts) + vehicle.arm.sleeve.mass
-    return 0.25 * mass * vehicle.gravity
+    return 0.25 * mass_of(vehicle) * vehicle.gravity
 
 
 class Sensors:
