@@ -47,7 +47,9 @@ class ContactParams(Struct, frozen=True, forbid_unknown_fields=True):
     unevenness: Annotated[
         float, knob("1", "standard deviation of both friction coefficients along and round the pipe", 0.0, 0.5)
     ] = 0.0
-    patch: Annotated[float, knob("m", "wavelength of their unevenness; from two thirds of it to double", 0.005, 1.0)] = 0.05
+    patch: Annotated[
+        float, knob("m", "wavelength of their unevenness; from two thirds of it to double", 0.005, 1.0)
+    ] = 0.05
     release_angle: Annotated[float, knob("rad", "gripper angle beyond which the sleeve is let go", 0.05, 3.0)] = 0.8
 
     def __post_init__(self) -> None:

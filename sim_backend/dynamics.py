@@ -29,9 +29,7 @@ Three = tuple[float, float, float]
 _CARRIERS = (Carrier.LINK_1, Carrier.LINK_2, Carrier.TOOL)
 
 
-def lump(
-    vehicle: Vehicle, parts: Iterable[Part], rotor_inertia: float, centre: Three = (0.0, 0.0, 0.0)
-) -> Array:
+def lump(vehicle: Vehicle, parts: Iterable[Part], rotor_inertia: float, centre: Three = (0.0, 0.0, 0.0)) -> Array:
     """The sums over base and parts, shape (38,), in the order of the ``L_`` indices of ``layout``.
 
     ``centre`` is the base's centre of mass (m, B), about which its inertia is.

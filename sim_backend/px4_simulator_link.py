@@ -70,9 +70,7 @@ class Px4SimulatorLink:
         #: Answers that the world waited for in vain.
         self.unanswered = 0
         self._told = Notices()
-        self._sensors = Px4Sensors(
-            world.params.sensors, hover_thrust(world.vehicle), params.sensors, params.gps, seed
-        )
+        self._sensors = Px4Sensors(world.params.sensors, hover_thrust(world.vehicle), params.sensors, params.gps, seed)
         self._mav = mavlink.MAVLink(None, srcSystem=_SIMULATOR[0], srcComponent=_SIMULATOR[1])
         self._full = world.vehicle.rotors.max_thrust
         self._curve = world.vehicle.rotors.curve

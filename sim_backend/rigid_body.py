@@ -418,7 +418,10 @@ def constants(
     put(at.HOVER_CURRENT, cell.hover_current, mass * vehicle.gravity)
     put(at.RATED_VOLTAGE, 0.0 if params.ideal_motors else rated_voltage(cell))
     for i in range(2):
-        put(at.LUMPED + i * at.LUMPED_SIZE, *lump(vehicle, parts[i], 0.0 if params.backlash else servo.rotor_inertia, centre))
+        put(
+            at.LUMPED + i * at.LUMPED_SIZE,
+            *lump(vehicle, parts[i], 0.0 if params.backlash else servo.rotor_inertia, centre),
+        )
     return p
 
 

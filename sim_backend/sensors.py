@@ -285,7 +285,9 @@ class Sensors:
         self._servos = _Line[ServoState](servos.period, servos.delay)
         start = self._poses.standard_normal(3).tolist()
         self._drift = _Drift(odometry.position_drift, odometry.drift_time, start)
-        self._jumps, self._doubts = (Spells(rate, when.spawn(1)[0]) for rate in (odometry.jump_rate, odometry.doubt_rate))
+        self._jumps, self._doubts = (
+            Spells(rate, when.spawn(1)[0]) for rate in (odometry.jump_rate, odometry.doubt_rate)
+        )
         self._where = when
         self._jumped = _EXACT
         self._doubted_until = 0.0

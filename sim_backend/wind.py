@@ -34,7 +34,9 @@ class WindParams(Struct, frozen=True, forbid_unknown_fields=True):
     mean: Annotated[float, knob("m/s", "mean wind where the vehicle flies", 0.0, 20.0)] = 0.0
     towards_deg: Annotated[float, knob("deg", "direction it blows to, from x of W towards y", -360.0, 360.0)] = 0.0
     gusts: Annotated[float, knob("m/s", "wind at 20 ft whose turbulence there is (MIL-F-8785C: W20)", 0.0, 30.0)] = 0.0
-    height: Annotated[float, knob("m", "above ground, for scale and intensity; the model begins at 10 ft", 0.0, 300.0)] = 3.05
+    height: Annotated[
+        float, knob("m", "above ground, for scale and intensity; the model begins at 10 ft", 0.0, 300.0)
+    ] = 3.05
     carried: Annotated[float, knob("m/s", "speed at which the turbulence is carried past", 0.1, 30.0)] = 2.0
 
 
