@@ -125,14 +125,14 @@ class Autopilot:
         s, params = setpoint, self.params
         if not isfinite(s.thrust + sum(s.torque_B) + sum(s.q_WB) + sum(s.w_WB_B)):
             return
-        if params.command_loss and self._random.random() < params.command_loss:
+        lost, more = self._random.random(), float(self._random.standard_exponential())
+        if lost < params.command_loss:
             return
         if t - self._stream_last > params.offboard_timeout:
             self._stream_start = t
         self._stream_last = t
         delay = params.wrench_delay if s.interface is Interface.WRENCH else params.command_delay
-        if params.command_jitter:
-            delay += params.command_jitter * float(self._random.standard_exponential())
+        delay += params.command_jitter * more
         self._last_due = max(self._last_due, t + delay)
         self._pending.append((self._last_due, s))
 

@@ -48,7 +48,7 @@ class ContactParams(Struct, frozen=True, forbid_unknown_fields=True):
         float, knob("1", "standard deviation of both friction coefficients along and round the pipe", 0.0, 0.5)
     ] = 0.0
     patch: Annotated[
-        float, knob("m", "wavelength of their unevenness; from two thirds of it to double", 0.005, 1.0)
+        float, knob("m", "wavelength of their unevenness; each wave has half of it to double", 0.005, 1.0)
     ] = 0.05
     release_angle: Annotated[float, knob("rad", "gripper angle beyond which the sleeve is let go", 0.05, 3.0)] = 0.8
 

@@ -417,11 +417,10 @@ def constants(
     mass = base.mass + sum(part.mass for part in parts[1])
     put(at.HOVER_CURRENT, cell.hover_current, mass * vehicle.gravity)
     put(at.RATED_VOLTAGE, 0.0 if params.ideal_motors else rated_voltage(cell))
+    # With play in the gears the rotors are a side of their own (servos.py) and weigh on no joint.
+    rotor_inertia = 0.0 if params.backlash else servo.rotor_inertia
     for i in range(2):
-        put(
-            at.LUMPED + i * at.LUMPED_SIZE,
-            *lump(vehicle, parts[i], 0.0 if params.backlash else servo.rotor_inertia, centre),
-        )
+        put(at.LUMPED + i * at.LUMPED_SIZE, *lump(vehicle, parts[i], rotor_inertia, centre))
     return p
 
 

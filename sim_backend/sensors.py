@@ -182,8 +182,8 @@ class _Drift:
         return self.value
 
 
-class Spells:
-    """Events at random times, so many a second in the mean (a Poisson process), each of the same length."""
+class _Events:
+    """Events at random times, so many a second in the mean (a Poisson process)."""
 
     def __init__(self, rate: float, random: np.random.Generator) -> None:
         self._rate, self._random = rate, random
@@ -285,9 +285,8 @@ class Sensors:
         self._servos = _Line[ServoState](servos.period, servos.delay)
         start = self._poses.standard_normal(3).tolist()
         self._drift = _Drift(odometry.position_drift, odometry.drift_time, start)
-        self._jumps, self._doubts = (
-            Spells(rate, when.spawn(1)[0]) for rate in (odometry.jump_rate, odometry.doubt_rate)
-        )
+        jumps, doubts = when.spawn(2)
+        self._jumps, self._doubts = _Events(odometry.jump_rate, jumps), _Events(odometry.doubt_rate, doubts)
         self._where = when
         self._jumped = _EXACT
         self._doubted_until = 0.0

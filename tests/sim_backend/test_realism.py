@@ -70,7 +70,7 @@ def test_nothing_is_off_by_default() -> None:
     assert params.odometry.exact
     assert params.autopilot.exact
     assert params.servos.exact
-    assert not (REALISTIC.odometry.exact or REALISTIC.autopilot.exact or REALISTIC.servos.exact)
+    assert not any(device.exact for device in (REALISTIC.odometry, REALISTIC.autopilot, REALISTIC.servos))
 
 
 def test_one_error_alone_spoils_nothing_else(vehicle: Vehicle) -> None:
