@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
@@ -94,5 +95,5 @@ def deviations(params: DeviationParams, seed: int) -> Deviations:
     )
 
 
-def _three(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Vec3:
+def _three(values: NDArray[np.float64]) -> Vec3:
     return (float(values[0]), float(values[1]), float(values[2]))

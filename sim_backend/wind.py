@@ -125,6 +125,8 @@ class Wind:
         return self.velocity
 
     def _turned(self) -> Vec3:
-        u, v, w = (0.0, 0.0, 0.0) if self._filters is None else (each.value for each in self._filters)
+        u = v = w = 0.0
+        if self._filters is not None:
+            u, v, w = (each.value for each in self._filters)
         u += self._mean
         return (self._cos * u - self._sin * v, self._sin * u + self._cos * v, w)

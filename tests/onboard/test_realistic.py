@@ -60,8 +60,8 @@ def look(where: World) -> tuple[Odometry | None, AutopilotState | None, ServoSta
 
 def flown(where: World, seconds: float = 1.2) -> list[object]:
     """What the devices tell in a jump into the air, and how the world went."""
-    autopilot, told = MockAutopilot(where), []
-    weight = 2.5 * 9.81
+    autopilot, weight = MockAutopilot(where), 2.5 * 9.81
+    told: list[object] = []
     for k in range(round(seconds / 0.004)):
         lift = weight * (1.1 if k % 50 < 25 else 1.3)
         zero = (0.0, 0.0, 0.0)

@@ -217,8 +217,7 @@ def test_messages_are_late_by_delay_and_jitter_in_order_and_some_never_come(vehi
     assert len(arrived) / 2000 == pytest.approx(0.9, abs=0.02)
 
 
-def test_set_points_are_late_by_delay_and_jitter_in_order_and_some_never_come(vehicle: Vehicle) -> None:
-    del vehicle
+def test_set_points_are_late_by_delay_and_jitter_and_some_never_come() -> None:
     autopilot = Autopilot(AutopilotParams(command_delay=0.012, command_jitter=0.002, command_loss=0.05), 4)
     u = np.zeros(at.DRIVE_SIZE)
     due = []
