@@ -23,8 +23,11 @@ SIZES = {
     "sensors.odometry.jump", "sensors.odometry.doubt_time", "sensors.odometry.doubt_confidence",
     "sensors.odometry.doubt_noise", "plant.contact.patch", "wind.towards_deg", "autopilot.command_delay",
 }  # fmt: skip
-#: Too rare to be met within a second.
-RARE = {"sensors.odometry.jump_rate": 5.0, "sensors.odometry.doubt_rate": 5.0}
+#: Too rare to be met within a second, so more of it.
+RARE = {
+    "sensors.odometry.jump_rate": 5.0, "sensors.odometry.doubt_rate": 5.0, "sensors.autopilot.loss": 0.3,
+    "autopilot.command_loss": 0.3,
+}  # fmt: skip
 
 
 def leaves(values: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
