@@ -9,6 +9,7 @@ Run from the repository's root: python -m docs.figures.realism
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -63,24 +64,30 @@ def flown(interface: str, seed: int, sets: tuple[str, ...], number: int) -> dict
 
 
 def shown(value: Any) -> str:
+    """A cell of the table."""
     return "" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)
 
 
+def lines(name: str, rows: list[dict[str, Any]]) -> list[str]:
+    """The table of one case, and the medians under it."""
+    out = ["", name, "", f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}"]
+    out += [f"| {' | '.join(shown(row[column]) for column in COLUMNS)} |" for row in rows]
+    for interface in INTERFACES:
+        for column in COLUMNS[2:7]:
+            values = [row[column] for row in rows if row["interface"] == interface and row[column] is not None]
+            if values:
+                middle, worst = median(values), max(values)
+                out.append(f"{interface}, {column}: median {middle:.2f}, worst {worst:.2f} of {len(values)}")
+    return out
+
+
 def main() -> None:
+    """Fly what is not kept yet, and print."""
     KEPT.mkdir(parents=True, exist_ok=True)
     for number, (name, sets) in enumerate(CASES.items()):
         pairs = [(interface, seed) for interface in INTERFACES for seed in SEEDS]
         rows = [flown(interface, seed, sets, number) for interface, seed in tqdm(pairs, desc=name)]
-        print(f"\n{name}\n\n| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
-        for row in rows:
-            print(f"| {' | '.join(shown(row[column]) for column in COLUMNS)} |")
-        for interface in INTERFACES:
-            for column in COLUMNS[2:7]:
-                values = [row[column] for row in rows if row["interface"] == interface and row[column] is not None]
-                if values:
-                    print(
-                        f"{interface}, {column}: median {median(values):.2f}, worst {max(values):.2f} of {len(values)}"
-                    )
+        sys.stdout.write("\n".join(lines(name, rows)) + "\n")
 
 
 if __name__ == "__main__":
