@@ -169,9 +169,9 @@ def _told(
             (*v, *sight.rpy_rate, *rates[:3]), command.thrust, thrust_model.thrust(thrust),
             (-base[0] * x, -base[1] * y, -base[2] * z), torque, command.torque_B is not None,
             (
-                momentum_observer.motor_torque(current[0], rates[0], servo, supply),
-                momentum_observer.motor_torque(current[1], rates[1], servo, supply),
-                momentum_observer.motor_torque(current[2], rates[2], servo, supply),
+                momentum_observer.servo_torque(current[0], rates[0], servo, supply),
+                momentum_observer.servo_torque(current[1], rates[1], servo, supply),
+                momentum_observer.servo_torque(current[2], rates[2], servo, supply),
             ),
             state.felt, sight.near, derived.site.normal, mass, vehicle.gravity, sight.payload,
         ),

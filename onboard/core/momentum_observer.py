@@ -30,6 +30,8 @@ from onboard.core.dynamics import Model
 from onboard.core.spec import note, spec
 from onboard.core.told import Nine, Told
 
+#: From this rate on a joint slides, rad/s; well above the grain of a servo's rate.
+_SLIDING = 0.05
 _ZERO: Nine = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -38,7 +40,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
 
     force_gain: Annotated[float, spec("rad/s", 0.1, 100.0, "K of the force")] = 20.0
     torque_gain: Annotated[float, spec("rad/s", 0.1, 100.0, "K of the torque on the body")] = 20.0
-    joint_gain: Annotated[float, spec("rad/s", 0.1, 100.0, "K of the torques on the joints")] = 15.0
+    joint_gain: Annotated[float, spec("rad/s", 0.1, 100.0, "K of the torques on the joints")] = 30.0
     velocity_gain: Annotated[
         float, spec("1/s", 0.0, 20.0, "how fast the integrated accelerometer follows the tracker's velocity")
     ] = 0.5
@@ -88,8 +90,10 @@ def step(state: State, told: Told, model: Model, params: Params, dt: float) -> S
     return State(predicted, residual, v, True)
 
 
-def motor_torque(current: float, rate: float, servo: Servo, supply: bool) -> float:
-    """Torque of a joint servo's motor at the output by its current (A) and rate (rad/s), N m; friction included.
+def servo_torque(current: float, rate: float, servo: Servo, supply: bool) -> float:
+    """Torque of a joint servo at its output by its current (A) and rate (rad/s), N m.
+
+    The gear's friction is taken off as far as it is known: all of it while the joint moves, none while it sticks.
 
     supply: the current is that of the supply, motor current times duty cycle, and the duty cycle is what overcomes
     resistance and back-EMF: i / i_stall = s |s + rate / no-load rate| with s = torque / stall torque.
@@ -100,7 +104,8 @@ def motor_torque(current: float, rate: float, servo: Servo, supply: bool) -> flo
         # where the motor brakes (s and s + speed of unlike sign) two torques draw the same current; this is the larger
         sign = 1.0 if share >= 0.0 else -1.0
         share = 0.5 * (sign * sqrt(speed * speed + 4.0 * abs(share)) - speed)
-    return servo.stall_torque * share
+    slip = max(-1.0, min(1.0, rate / _SLIDING))
+    return servo.stall_torque * share - slip * servo.friction_static - rate * servo.friction_viscous
 
 
 @compiled(
