@@ -143,7 +143,9 @@ def words(told: dict[str, Any]) -> str:
     if told["ratio"] is not None and told["selected"] != "paper":
         better = told["ratio"] >= 1.0
         ratio = told["ratio"] if better else 1.0 / told["ratio"]
-        parts[0] = f"* is the one selected for control: {ratio:.2f} times {'nearer to' if better else 'farther from'} the truth than the paper's."
+        parts[0] = (
+            f"* is the one selected for control: {ratio:.2f} times {'nearer to' if better else 'farther from'} the truth than the paper's."
+        )
     if told["cost_all"] is not None:
         parts.append(f"All together {told['cost_all']:.1f} us a tick, measured after the flight.")
     if told["false_contacts"] is not None:

@@ -417,9 +417,7 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
             joints_ref=rows[:, 17:20],
             force_des=rows[:, 20],
             force_est=rows[:, 21],
-            forces={}
-            if np.isnan(rows[:, 64]).all()
-            else dict(zip((*ESTIMATORS, FELT), rows[:, 64:69].T, strict=True)),
+            forces={} if np.isnan(rows[:, 64]).all() else dict(zip((*ESTIMATORS, FELT), rows[:, 64:69].T, strict=True)),
             triggered=rows[:, 63] > 0,
             alarm=rows[:, 69] > 0,
             dispensing=rows[:, 22] > 0,

@@ -144,7 +144,7 @@ def step(
     distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
     rpy_rate = math3.euler_rates_from_body(rpy, w)
     sight = estimators.Sight(
-        autopilot.f_B, acceleration, v, ahead, odometry is not state.odometry, R, p, rpy, rpy_rate, servos, payload,
+        autopilot.f_B, acceleration, v, ahead, odometry is not state.odometry, R, p, rpy, rpy_rate, servos, ages[2], payload,
         reference.a if reference is not None else _O, at_pipe and distance < params.estimators.gate,
         progress.arrived and not at_pipe,
     )  # fmt: skip

@@ -20,6 +20,9 @@ from onboard.core.types import Estimator, Force, Forces, Mat3
 if TYPE_CHECKING:
     from onboard.core.params import Params as AllParams
 
+#: Currents older than this feel nothing of now, s.
+_LATE = 0.05
+
 
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
     """Which estimator is believed, and what each is told."""
@@ -68,6 +71,8 @@ class Sight(Struct, frozen=True, gc=False):
     rpy: Vec3
     rpy_rate: Vec3
     servos: ServoState
+    servos_age: float
+    """s."""
     payload: bool
     desired: Vec3
     near: bool
@@ -82,7 +87,7 @@ def step(
 ) -> tuple[State, Forces]:  # fmt: skip
     """One tick. taring: its readings belong to a tare; tared: they end it; dropped: it was broken off."""
     own = params.estimators
-    told, thrust = _told(state, sight, command, derived, params, dt)
+    told, thrust = tell(state, sight, command, derived, params, dt)
     R = sight.R
 
     paper = observer.step(
@@ -112,7 +117,9 @@ def step(
     n = derived.site.normal
     one, two, three, four = tares
     seen = (
-        Force(*_read(paper.force, one.tare, R, n)) if params.observer.tare else Force(paper.force, _along(paper.force, n)),
+        Force(*_read(paper.force, one.tare, R, n))
+        if params.observer.tare
+        else Force(paper.force, _along(paper.force, n)),
         Force(*_read(body.force, two.tare, R, n)),
         Force(*_read(momentum.force, three.tare, R, n)),
         # its disturbance holds whatever was there before the contact: only the whole force wants a tare
@@ -148,9 +155,10 @@ def _read(force: Vec3, tare_B: Vec3, R: Mat3, normal: tuple[float, float]) -> tu
     return tared, _along(tared, normal)
 
 
-def _told(
+def tell(
     state: State, sight: Sight, command: Command, derived: Derived, params: AllParams, dt: float
 ) -> tuple[Told, thrust_model.State]:
+    """What the estimators are told in this tick, and the state of the thrust model after it."""
     own, vehicle, servos = params.estimators, params.vehicle, sight.servos
     mass = derived.model.mass(sight.payload)
     thrust = thrust_model.step(state.thrust, command.thrust, sight.f_B[2], mass, sight.hovering, own.thrust, dt)
@@ -173,7 +181,7 @@ def _told(
                 momentum_observer.servo_torque(current[1], rates[1], servo, supply),
                 momentum_observer.servo_torque(current[2], rates[2], servo, supply),
             ),
-            state.felt, sight.near, derived.site.normal, mass, vehicle.gravity, sight.payload,
+            state.felt, servos.torque_on and sight.servos_age < _LATE and not any(servos.error[:3]), sight.near, derived.site.normal, mass, vehicle.gravity, sight.payload,
         ),
         thrust,
     )  # fmt: skip

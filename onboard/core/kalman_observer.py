@@ -10,8 +10,7 @@ the joints (in the arm's plane). Wind and contact are the same force to the firs
 - the contact gate: where the tip is not near the pipe, f is zero and all is wind;
 - the onset: a contact rises in tenths of a second, so f may move fast and d only slowly (``force_rate``,
   ``wind_rate``);
-- what the arm feels (``joint_noise``), which anchors f in the long run; gear friction makes it no better than some
-  tenths of a newton, and correlated, so that its noise here is that of many ticks.
+- what the arm feels (``joint_noise``): no wind acts on the tip. It decides slowly; what is fast is the accelerometer's.
 
 An offset of any kind (accelerometer, thrust, steady wind) is in d, so that f wants no tare.
 """
@@ -37,12 +36,12 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     """Noise densities; each is a standard deviation."""
 
     force_rate: Annotated[float, spec("N/s^0.5", 0.001, 20.0, "random walk of the contact force near the pipe")] = 1.2
-    wind_rate: Annotated[float, spec("N/s^0.5", 0.001, 20.0, "random walk of the disturbance near the pipe")] = 0.05
+    wind_rate: Annotated[float, spec("N/s^0.5", 0.001, 20.0, "random walk of the disturbance near the pipe")] = 0.5
     free_rate: Annotated[float, spec("N/s^0.5", 0.001, 20.0, "the same in free flight")] = 0.5
     velocity_rate: Annotated[float, spec("m/s^1.5", 1e-4, 10.0, "errors of thrust and attitude in v'")] = 0.10
-    force_noise: Annotated[float, spec("N", 0.001, 20.0, "force by the accelerometer, each tick")] = 0.5
+    force_noise: Annotated[float, spec("N", 0.001, 20.0, "force by the accelerometer, each tick")] = 0.7
     velocity_noise: Annotated[float, spec("m/s", 0.001, 2.0, "velocity by the tracker, each sample")] = 0.05
-    joint_noise: Annotated[float, spec("N", 0.01, 1000.0, "force by the joints, each tick; large: not used")] = 6.0
+    joint_noise: Annotated[float, spec("N", 0.01, 1000.0, "force by the joints, each tick; large: not used")] = 0.3
 
 
 class State(Struct, frozen=True, gc=False):
@@ -66,7 +65,7 @@ def step(state: State, told: Told, params: Params, dt: float) -> State:
         (params.wind_rate if told.near else params.free_rate) ** 2 * dt,
         params.force_noise**2,
         params.velocity_noise**2 if told.fresh else 0.0,
-        params.joint_noise**2,
+        params.joint_noise**2 if told.joints_known else 0.0,
     )
     x, plane, across, force, contact = _step(
         state.x, state.plane, state.across, told.f_B, told.v_W, told.felt, told.R, told.thrust, told.drag,
@@ -75,7 +74,9 @@ def step(state: State, told: Told, params: Params, dt: float) -> State:
     return State(x, plane, across, force, contact, True)
 
 
-@compiled("Tuple((UniTuple(f8, 3), UniTuple(f8, 6)))(UniTuple(f8, 3), UniTuple(f8, 6), f8, f8, f8, f8, f8, f8, f8, UniTuple(f8, 6), b1)")
+@compiled(
+    "Tuple((UniTuple(f8, 3), UniTuple(f8, 6)))(UniTuple(f8, 3), UniTuple(f8, 6), f8, f8, f8, f8, f8, f8, f8, UniTuple(f8, 6), b1)"
+)
 def _axis(
     x: Vec3, p: Six, drive: float, measured: float, velocity: float, felt: float, joint_noise: float, mass: float,
     dt: float, noise: Six, near: bool,
@@ -150,9 +151,7 @@ def _step(
     b, q = _axis(
         (x[3], x[4], x[5]), across, (n * wy - m * wx) / mass, n * zy - m * zx, v[1], 0.0, 0.0, mass, dt, noise, near
     )
-    c, _ = _axis(
-        (x[6], x[7], x[8]), plane, wz / mass - gravity, zz, v[2], felt[2], noise[5], mass, dt, noise, near
-    )
+    c, _ = _axis((x[6], x[7], x[8]), plane, wz / mass - gravity, zz, v[2], felt[2], noise[5], mass, dt, noise, near)
     ahead, left, up = a[1] + a[2], b[1] + b[2], c[1] + c[2]
     return (
         (a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]),

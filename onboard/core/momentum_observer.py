@@ -12,8 +12,7 @@ The velocity is that of the tracker at low frequencies and the integral of the a
 angles are zero when the autopilot is not sent torques: its own loops are not known.
 
 The rows of the joints see what acts on the tip, and no wind on the base: ``felt`` is the force at the tip in the arm's
-plane that explains them best. It carries the friction of the gears (``friction`` / lever, some tenths of a newton), so
-it is a witness of contact rather than a gauge.
+plane that explains them best. What is not known of the gears' friction stays in it.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.5
     supply_current: Annotated[
         bool, note("the servos tell the current of their supply, not of the motor, as XC330s do")
-    ] = False
+    ] = True
 
 
 class State(Struct, frozen=True, gc=False):

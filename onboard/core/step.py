@@ -70,9 +70,7 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
     gate, autopilot, servos, clipped = limits.step(
         state.limits, autopilot, servos, permission, facts.measured(seen), derived.bounds, dt
     )
-    sent = estimators.Command(
-        autopilot.thrust, autopilot.torque_B if params.interface is Interface.WRENCH else None
-    )
+    sent = estimators.Command(autopilot.thrust, autopilot.torque_B if params.interface is Interface.WRENCH else None)
     events = tuple(Event(inputs.t_ns, *text) for text in (*alarms, *said)) if alarms or said else ()
     return (
         State(seen, safe, task, progress, guided, reference, laws, gate, sent, flying, obeyed),

@@ -43,6 +43,8 @@ class Told(Struct, frozen=True, gc=False):
     """What the servos give by their currents, N m."""
     felt: Vec3
     """Force at the tip by the joints' torques one tick ago, tared, N, W."""
+    joints_known: bool
+    """The servos are under torque, told lately, and without errors: what they feel counts."""
     near: bool
     """The tip is where there may be contact: the contact gate."""
     normal: tuple[float, float]
