@@ -141,11 +141,7 @@ def words(told: dict[str, Any]) -> str:
     """What the table leaves to be said."""
     parts = ["* is the one selected for control."]
     if told["ratio"] is not None and told["selected"] != "paper":
-        better = told["ratio"] >= 1.0
-        ratio = told["ratio"] if better else 1.0 / told["ratio"]
-        parts[0] = (
-            f"* is the one selected for control: {ratio:.2f} times {'nearer to' if better else 'farther from'} the truth than the paper's."
-        )
+        parts.append(f"The paper's RMSE is {told['ratio']:.2f} times its own.")
     if told["cost_all"] is not None:
         parts.append(f"All together {told['cost_all']:.1f} us a tick, measured after the flight.")
     if told["false_contacts"] is not None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
@@ -287,6 +288,11 @@ class Run:
     events: list[Event] = field(default_factory=list)
     """In order of their times."""
     start_ns: int = 0
+
+    def with_estimates(self, forces: dict[str, Array], triggered: Mask, alarm: Mask, selected: str) -> Run:
+        """The same run with other estimates of the contact force, the ``selected`` one being believed."""
+        config = msgspec.structs.replace(self.config, estimators=_Estimators(selected))
+        return replace(self, forces=forces, triggered=triggered, alarm=alarm, config=config)
 
     def where(self, *phases: str) -> Mask:
         """Ticks in any of these phases."""

@@ -33,7 +33,7 @@ _CONTACT = (Phase.TARE, Phase.ADVANCE, Phase.PRESS, Phase.RELEASE)
 
 
 class Recomputed(Struct, frozen=True):
-    """Compressions by each estimator, N, one a tick of the log (None where it did not run), and what a tick costs, us."""
+    """Compressions by each estimator, N, one a tick of the log (None where it did not run); costs of a tick, us."""
 
     forces: dict[str, list[float | None]]
     triggered: list[bool]

@@ -46,7 +46,8 @@ class State(Struct, frozen=True, gc=False):
 def step(state: State, distance: float, force: float, felt: float, desired: float, params: Params, dt: float) -> State:
     """One tick.
 
-    distance: of the tip from the crack, m. force, felt, desired: compression estimated, felt by the joints and wanted, N.
+    distance: of the tip from the crack, m. force, felt, desired: compression as estimated, as felt by the joints, and as
+    wanted, N.
     """
     before = force if state.before is None else state.before
     if state.contact:

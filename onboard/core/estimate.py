@@ -144,8 +144,8 @@ def step(
     distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
     rpy_rate = math3.euler_rates_from_body(rpy, w)
     sight = estimators.Sight(
-        autopilot.f_B, acceleration, v, ahead, odometry is not state.odometry, R, p, rpy, rpy_rate, servos, ages[2], payload,
-        reference.a if reference is not None else _O, at_pipe and distance < params.estimators.gate,
+        autopilot.f_B, acceleration, v, ahead, odometry is not state.odometry, R, p, rpy, rpy_rate, servos, ages[2],
+        payload, reference.a if reference is not None else _O, at_pipe and distance < params.estimators.gate,
         progress.arrived and not at_pipe,
     )  # fmt: skip
     dropped = not progress.tare_begun
@@ -164,10 +164,10 @@ def step(
         trigger = _QUIET
         if phase in FREE_FLIGHT:
             alarm = contact_trigger.step(alarm, 0.0, compression, forces.felt, 0.0, params.contact, dt)
-            if alarm.contact:
-                forces = replace(forces, alarm=True)
         else:
             alarm = _QUIET
+    if alarm.contact:
+        forces = replace(forces, alarm=True)
 
     estimate = Estimate(
         p, v, rpy, rpy_rate, R, w, acceleration, joints, rates, tip, force,

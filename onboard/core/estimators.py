@@ -96,6 +96,13 @@ def step(
     body = body_observer.step(state.body, told, own.body, dt)
     momentum = momentum_observer.step(state.momentum, told, derived.model, own.momentum, dt)
     kalman = kalman_observer.step(state.kalman, told, own.kalman, dt)
+    # one absurd sample (finite, but its square is not) must not stay in a filter for ever
+    if not _sound(body.force):
+        body = body_observer.State()
+    if not _sound(momentum.force) or not _sound(momentum.joints):
+        momentum = momentum_observer.State()
+    if not _sound(kalman.force):
+        kalman = kalman_observer.State()
 
     readings = (paper.force, body.force, momentum.force, kalman.force)
     tares, joints = state.tares, state.joints
@@ -146,6 +153,11 @@ def tare_in_force(state: State, params: Params) -> Vec3:
     return state.tares[tuple(Estimator).index(params.selected)].tare
 
 
+def _sound(force: Vec3) -> bool:
+    total = force[0] + force[1] + force[2]
+    return total - total == 0.0
+
+
 def _along(force: Vec3, normal: tuple[float, float]) -> float:
     return -(force[0] * normal[0] + force[1] * normal[1])
 
@@ -181,7 +193,8 @@ def tell(
                 momentum_observer.servo_torque(current[1], rates[1], servo, supply),
                 momentum_observer.servo_torque(current[2], rates[2], servo, supply),
             ),
-            state.felt, servos.torque_on and sight.servos_age < _LATE and not any(servos.error[:3]), sight.near, derived.site.normal, mass, vehicle.gravity, sight.payload,
+            state.felt, servos.torque_on and sight.servos_age < _LATE and not any(servos.error[:3]), sight.near,
+            derived.site.normal, mass, vehicle.gravity, sight.payload,
         ),
         thrust,
     )  # fmt: skip

@@ -75,7 +75,8 @@ def step(state: State, told: Told, params: Params, dt: float) -> State:
 
 
 @compiled(
-    "Tuple((UniTuple(f8, 3), UniTuple(f8, 6)))(UniTuple(f8, 3), UniTuple(f8, 6), f8, f8, f8, f8, f8, f8, f8, UniTuple(f8, 6), b1)"
+    "Tuple((UniTuple(f8, 3), UniTuple(f8, 6)))"
+    "(UniTuple(f8, 3), UniTuple(f8, 6), f8, f8, f8, f8, f8, f8, f8, UniTuple(f8, 6), b1)"
 )
 def _axis(
     x: Vec3, p: Six, drive: float, measured: float, velocity: float, felt: float, joint_noise: float, mass: float,
