@@ -100,7 +100,7 @@ def recompute(
             if ukf:
                 value = None
                 if outputs.phase in _CONTACT and told.valid:
-                    slow = slow or Ukf(derived.model.mass(told.payload), asked.vehicle.gravity, told)
+                    slow = slow or Ukf(derived.model.mass(told.payload), asked.vehicle.gravity, told.v_WB, told.rpy)
                     begun = perf_counter_ns()
                     value = _slowly(slow, told, seen, before, derived, asked, dt)
                     spent.append(perf_counter_ns() - begun)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.samples import Vec3
 from onboard.core import math3
-from onboard.core.types import Estimate, Mat3
+from onboard.core.types import Mat3
 
 if TYPE_CHECKING:
     from filterpy.kalman import UnscentedKalmanFilter
@@ -31,19 +31,19 @@ _NOISE = (0.05, 0.003, 0.25)
 class Ukf:
     """One filter, begun where the vehicle is. Needs the package filterpy (extra ``sim``)."""
 
-    def __init__(self, mass: float, gravity: float, start: Estimate) -> None:
+    def __init__(self, mass: float, gravity: float, v_W: Vec3, rpy: Vec3) -> None:
         from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
         self._mass, self._gravity = mass, gravity
         points = MerweScaledSigmaPoints(9, alpha=0.5, beta=2.0, kappa=0.0)
         self._filter: UnscentedKalmanFilter = UnscentedKalmanFilter(9, 9, 0.004, self._measured, self._moved, points)
-        self._filter.x = np.array([*start.v_WB, *start.rpy, 0.0, 0.0, 0.0])
+        self._filter.x = np.array([*v_W, *rpy, 0.0, 0.0, 0.0])
         self._filter.P = np.diag([0.01] * 3 + [1e-4] * 3 + [1.0] * 3)
         self._filter.R = np.diag(np.repeat(_NOISE, 3) ** 2)
         self._drive: tuple[float, Vec3] = (0.0, (0.0, 0.0, 0.0))
         self._tare: Vec3 = (0.0, 0.0, 0.0)
         self._sum, self._count = np.zeros(3), 0
-        self._R: Mat3 = start.R_WB
+        self._R: Mat3 = math3.matrix_from_euler(rpy)
 
     def step(self, thrust: float, f_B: Vec3, w_WB_B: Vec3, rpy: Vec3, v_W: Vec3, R_WB: Mat3, dt: float) -> Vec3:
         """One tick: thrust (N) and gyroscope (rad/s) drive; the rest is measured. Gives the tared force, N, W."""

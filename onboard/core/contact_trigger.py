@@ -46,7 +46,7 @@ class State(Struct, frozen=True, gc=False):
 def step(state: State, distance: float, force: float, felt: float, desired: float, params: Params, dt: float) -> State:
     """One tick.
 
-    distance: of the tip from the crack, m. force, felt, desired: compression as estimated, as felt by the joints, and as
+    distance: of the tip from the crack, m. force, felt, desired: compression as estimated, as felt by the joints, as
     wanted, N.
     """
     before = force if state.before is None else state.before
