@@ -29,7 +29,7 @@ DERIVED = derive(CONFIG)
 DT, G = 0.004, CONFIG.vehicle.gravity
 MASS = DERIVED.model.mass(True)
 JOINTS: Vec3 = (-1.0, 1.0, 0.0)
-O: Vec3 = (0.0, 0.0, 0.0)
+ZERO: Vec3 = (0.0, 0.0, 0.0)
 NAMES = tuple(estimator.value for estimator in Estimator)
 Profile = Callable[[float], float]
 
@@ -48,8 +48,8 @@ class Craft:
         self.t = 0.0
 
     def tick(
-        self, push: float = 0.0, wind: Vec3 = O, pitch: float = 0.0, near: bool = True, hovering: bool = False,
-        taring: bool = False, tared: bool = False, swing: Vec3 = O, noise: Vec3 = O, drop: bool = True,
+        self, push: float = 0.0, wind: Vec3 = ZERO, pitch: float = 0.0, near: bool = True, hovering: bool = False,
+        taring: bool = False, tared: bool = False, swing: Vec3 = ZERO, noise: Vec3 = ZERO, drop: bool = True,
     ) -> Forces:  # fmt: skip
         """push: true compression, N; swing: acceleration of the joints, rad/s^2; noise: of the accelerometer."""
         model, mass = DERIVED.model, MASS * self.mass
@@ -67,11 +67,11 @@ class Craft:
             )
         )  # type: ignore[arg-type]
         given = self.thrust * np.array((R[2], R[5], R[8])) + drag + np.array(wind) + np.array((-push, 0.0, 0.0))
-        q = (*O, *rpy, *self.joints.tolist())
-        qd = (*self.v.tolist(), *O, *self.joint_rates.tolist())
-        without = np.array(model.inverse_dynamics(q, qd, (*O, *O, *swing), True))  # type: ignore[arg-type]
+        q = (*ZERO, *rpy, *self.joints.tolist())
+        qd = (*self.v.tolist(), *ZERO, *self.joint_rates.tolist())
+        without = np.array(model.inverse_dynamics(q, qd, (*ZERO, *ZERO, *swing), True))  # type: ignore[arg-type]
         a = (given - without[:3]) / mass if self.mass == 1.0 else (given - np.array((0.0, 0.0, mass * G))) / mass
-        tau = np.array(model.inverse_dynamics(q, qd, (*a.tolist(), *O, *swing), True))  # type: ignore[arg-type]
+        tau = np.array(model.inverse_dynamics(q, qd, (*a.tolist(), *ZERO, *swing), True))  # type: ignore[arg-type]
         tau -= np.array(model.contact_torque(q, (-push, 0.0, 0.0)))  # type: ignore[arg-type]
         torque = math3.body_torque_from_euler(rpy, (tau[3], tau[4], tau[5]))
         servo = CONFIG.vehicle.servo
@@ -90,7 +90,7 @@ class Craft:
         )  # fmt: skip
         vx, vy, vz = self.v.tolist()
         sight = Sight(
-            seen, (x, y, z - G), (vx, vy, vz), 0.0, True, R, O, rpy, O, servos, 0.0, True, O, near, hovering
+            seen, (x, y, z - G), (vx, vy, vz), 0.0, True, R, ZERO, rpy, ZERO, servos, 0.0, True, ZERO, near, hovering
         )  # fmt: skip
         self.state, self.forces = estimators.step(
             self.state, sight, Command(self.command, torque), taring, tared, drop and not taring, DERIVED, self.config,
@@ -102,7 +102,7 @@ class Craft:
         self.t += DT
         return self.forces
 
-    def hover(self, seconds: float = 5.0, bias: Vec3 = O) -> None:
+    def hover(self, seconds: float = 5.0, bias: Vec3 = ZERO) -> None:
         """Held where it is, calibrated and tared; the vehicle's own velocity stays what it is."""
         n = round(seconds / DT)
         for _ in range(n):
@@ -168,7 +168,7 @@ def test_where_there_is_no_force_none_is_read() -> None:
     for k in range(1000):
         forces = craft.tick(pitch=0.1 * sin(0.01 * k), near=k > 500)
         for name in NAMES:
-            assert getattr(forces, name).force_W == pytest.approx(O, abs=0.02), (name, k)
+            assert getattr(forces, name).force_W == pytest.approx(ZERO, abs=0.02), (name, k)
         assert abs(forces.felt) < 0.02
 
 
@@ -212,7 +212,7 @@ def test_wind_away_from_the_pipe_is_no_contact() -> None:
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     ("mass", "thrust", "bias", "bound"),
-    [(1.0, 0.95, O, 0.06), (1.0, 1.05, O, 0.06), (1.03, 1.0, O, 0.12), (1.0, 1.0, (0.05, -0.03, 0.02), 0.06)],
+    [(1.0, 0.95, ZERO, 0.06), (1.0, 1.05, ZERO, 0.06), (1.03, 1.0, ZERO, 0.12), (1.0, 1.0, (0.05, -0.03, 0.02), 0.06)],
     ids=["weak", "strong", "heavy", "biased accelerometer"],
 )
 def test_model_errors_are_tared(name: str, mass: float, thrust: float, bias: Vec3, bound: float) -> None:
@@ -315,15 +315,14 @@ def test_servos_that_say_nothing_are_not_asked() -> None:
     """A limp servo feels nothing, which is not the same as no contact."""
     craft = Craft()
     craft.hover()
-    for _, forces in craft.press(constant, 1.0):
-        pass
-    state, told = craft.state, forces
+    told = [forces for _, forces in craft.press(constant, 1.0)][-1]
+    state = craft.state
     five = (0.0, 0.0, 0.0, 0.0, 0.0)
     limp = ServoState(0, (*JOINTS, 0.0, 0.0), five, five, five, five, (0, 0, 0, 0, 0), False)
     f_B = (-2.0 / MASS, 0.0, G)
     for _ in range(500):
-        sight = Sight(f_B, (f_B[0], 0.0, 0.0), O, 0.0, False, math3.matrix_from_euler(O), O, O, O, limp, 0.0, True, O, True, False)  # noqa: E501 # fmt: skip
-        state, told = estimators.step(state, sight, Command(MASS * G, O), False, False, True, DERIVED, CONFIG, DT)
+        sight = Sight(f_B, (f_B[0], 0.0, 0.0), ZERO, 0.0, False, math3.matrix_from_euler(ZERO), ZERO, ZERO, ZERO, limp, 0.0, True, ZERO, True, False)  # noqa: E501 # fmt: skip
+        state, told = estimators.step(state, sight, Command(MASS * G, ZERO), False, False, True, DERIVED, CONFIG, DT)
     assert told.kalman.contact == pytest.approx(2.0, abs=0.2)
 
 
@@ -346,7 +345,7 @@ def test_the_torque_is_found_from_the_current_of_the_supply(torque: float, rate:
 @settings(max_examples=50)
 def test_the_force_at_the_tip_is_found_from_its_torques(x: float, z: float, theta_3: float) -> None:
     angles = (-1.0, 1.0, theta_3)
-    rows = DERIVED.model.contact_torque((*O, *O, *angles), (x, 0.0, z))
+    rows = DERIVED.model.contact_torque((*ZERO, *ZERO, *angles), (x, 0.0, z))
     found = momentum_observer.force_at_tip(rows[6:], angles, CONFIG.vehicle.arm)
     assert found == pytest.approx((x, z), abs=0.02)
 
@@ -386,15 +385,15 @@ def test_a_gust_with_the_tip_at_the_crack(selected: Estimator, false: bool) -> N
 def test_the_unscented_filter_reads_a_known_force() -> None:
     craft = Craft()
     started = None
-    force: Vec3 = O
+    force: Vec3 = ZERO
     for k in range(700):
         push = 0.0 if k < 300 else 1.5
         v = (float(craft.v[0]), float(craft.v[1]), float(craft.v[2]))
         craft.tick(push)
         f_B = (-push / MASS + -CONFIG.vehicle.base.drag[0] * v[0] / MASS, 0.0, G)
         if started is None:
-            started = Ukf(MASS, G, v, O)
-        force = started.step(MASS * G, f_B, O, O, v, math3.matrix_from_euler(O), DT)
+            started = Ukf(MASS, G, v, ZERO)
+        force = started.step(MASS * G, f_B, ZERO, ZERO, v, math3.matrix_from_euler(ZERO), DT)
         if 100 <= k < 200:
             started.tare(done=k == 199)
     assert force == pytest.approx((-1.5, 0.0, 0.0), abs=0.1)
