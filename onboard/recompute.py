@@ -102,7 +102,7 @@ def recompute(
                 if outputs.phase in _CONTACT and told.valid:
                     slow = slow or Ukf(derived.model.mass(told.payload), asked.vehicle.gravity, told.v_WB, told.rpy)
                     begun = perf_counter_ns()
-                    value = _slowly(slow, told, seen, before, derived, asked, dt)
+                    value = _slowly(slow, told, seen, derived, dt)
                     spent.append(perf_counter_ns() - begun)
                     if before.progress.taring:
                         slow.tare(done=before.progress.tared)
@@ -129,9 +129,7 @@ def changed(config: Config, sets: Sequence[str]) -> Config:
     return compose(Config, [Layer("the log", msgspec.to_builtins(config)), *(parse_set(text) for text in sets)])
 
 
-def _slowly(
-    slow: Ukf, told: Estimate, seen: estimate.State, before: State, derived: Derived, params: Config, dt: float
-) -> float:
+def _slowly(slow: Ukf, told: Estimate, seen: estimate.State, derived: Derived, dt: float) -> float:
     autopilot = seen.autopilot
     assert autopilot is not None
     thrust = seen.forces.thrust

@@ -35,7 +35,7 @@ class Ukf:
         from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
         self._mass, self._gravity = mass, gravity
-        points = MerweScaledSigmaPoints(9, alpha=0.5, beta=2.0, kappa=0.0)
+        points = MerweScaledSigmaPoints(9, alpha=1.0, beta=2.0, kappa=0.0)
         self._filter: UnscentedKalmanFilter = UnscentedKalmanFilter(9, 9, 0.004, self._measured, self._moved, points)
         self._filter.x = np.array([*v_W, *rpy, 0.0, 0.0, 0.0])
         self._filter.P = np.diag([0.01] * 3 + [1e-4] * 3 + [1.0] * 3)
