@@ -10,9 +10,9 @@ from tests.acceptance.flights import SHORT, Hangar, completed
 pytestmark = pytest.mark.parametrize("selected", ["paper", "body", "momentum", "kalman"])
 
 
-def test_the_mission_is_flown_with_each_of_them_in_the_loop(hangar: Hangar, selected: str) -> None:
+def test_the_mission_is_flown_with_each_of_them_in_the_loop(fly: Hangar, selected: str) -> None:
     """Ideal sensors: all see the same force, and none reads one where none is."""
-    flown = hangar(*SHORT, f"estimators.selected={selected}")
+    flown = fly(*SHORT, f"estimators.selected={selected}")
     assert completed(flown)
     told = flown.metrics["estimators"]
     assert told["selected"] == selected
