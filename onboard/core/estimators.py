@@ -20,6 +20,8 @@ from onboard.core.types import Estimator, Force, Forces, Mat3
 if TYPE_CHECKING:
     from onboard.core.params import Params as AllParams
 
+#: No force of this world, N or N m.
+_ABSURD = 1e4
 #: Currents older than this feel nothing of now, s.
 _LATE = 0.05
 
@@ -96,7 +98,7 @@ def step(
     body = body_observer.step(state.body, told, own.body, dt)
     momentum = momentum_observer.step(state.momentum, told, derived.model, own.momentum, dt)
     kalman = kalman_observer.step(state.kalman, told, own.kalman, dt)
-    # one absurd sample (finite, but its square is not) must not stay in a filter for ever
+    # one absurd sample must not stay in a filter: it would take minutes to fade, or never do
     if not _sound(body.force):
         body = body_observer.State()
     if not _sound(momentum.force) or not _sound(momentum.joints):
@@ -154,8 +156,7 @@ def tare_in_force(state: State, params: Params) -> Vec3:
 
 
 def _sound(force: Vec3) -> bool:
-    total = force[0] + force[1] + force[2]
-    return total - total == 0.0
+    return abs(force[0]) + abs(force[1]) + abs(force[2]) < _ABSURD
 
 
 def _along(force: Vec3, normal: tuple[float, float]) -> float:

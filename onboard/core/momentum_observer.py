@@ -98,11 +98,15 @@ def servo_torque(current: float, rate: float, servo: Servo, supply: bool) -> flo
     resistance and back-EMF: i / i_stall = s |s + rate / no-load rate| with s = torque / stall torque.
     """
     share = current / servo.stall_current
-    if supply:
+    if supply and share != 0.0:
         speed = rate / servo.no_load_speed
-        # where the motor brakes (s and s + speed of unlike sign) two torques draw the same current; this is the larger
-        sign = 1.0 if share >= 0.0 else -1.0
-        share = 0.5 * (sign * sqrt(speed * speed + 4.0 * abs(share)) - speed)
+        sign = 1.0 if share > 0.0 else -1.0
+        square, four = speed * speed, 4.0 * abs(share)
+        if sign * speed < 0.0 and four <= square:
+            # braking: up to three torques draw this current; the least is the likeliest of an arm that hardly works
+            share = 0.5 * sign * (abs(speed) - sqrt(square - four))
+        else:
+            share = 0.5 * (sign * sqrt(square + four) - speed)
     slip = max(-1.0, min(1.0, rate / _SLIDING))
     return servo.stall_torque * share - slip * servo.friction_static - rate * servo.friction_viscous
 

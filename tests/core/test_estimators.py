@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from drivers.samples import ServoState, Vec3
 from onboard.config import load_config
@@ -24,7 +25,8 @@ from onboard.core.params import Params
 from onboard.core.types import Estimator, Forces
 from onboard.ukf import Ukf
 
-CONFIG = load_config("paper")
+#: Without drag, so that the paper's observer, which knows none, sees what the others see.
+CONFIG = load_config("paper", sets=["vehicle.base.drag=[0,0,0]"])
 DERIVED = derive(CONFIG)
 DT, G = 0.004, CONFIG.vehicle.gravity
 MASS = DERIVED.model.mass(True)
@@ -45,11 +47,10 @@ class Craft:
         self.thrust = MASS * mass * G
         self.command = self.thrust / thrust
         self.joints, self.joint_rates = np.array(JOINTS), np.zeros(3)
-        self.t = 0.0
 
     def tick(
         self, push: float = 0.0, wind: Vec3 = ZERO, pitch: float = 0.0, near: bool = True, hovering: bool = False,
-        taring: bool = False, tared: bool = False, swing: Vec3 = ZERO, noise: Vec3 = ZERO, drop: bool = True,
+        taring: bool = False, tared: bool = False, swing: Vec3 = ZERO, noise: Vec3 = ZERO,
     ) -> Forces:  # fmt: skip
         """push: true compression, N; swing: acceleration of the joints, rad/s^2; noise: of the accelerometer."""
         model, mass = DERIVED.model, MASS * self.mass
@@ -57,55 +58,44 @@ class Craft:
         R = math3.matrix_from_euler(rpy)
         wanted = self.share * self.command
         self.thrust += (wanted - self.thrust) * (DT / (self.lag + DT))
-        drag = np.array(
-            math3.rotate(
-                R,
-                tuple(
-                    -d * x
-                    for d, x in zip(CONFIG.vehicle.base.drag, math3.rotate_transposed(R, tuple(self.v)), strict=True)
-                ),
-            )
-        )  # type: ignore[arg-type]
-        given = self.thrust * np.array((R[2], R[5], R[8])) + drag + np.array(wind) + np.array((-push, 0.0, 0.0))
-        q = (*ZERO, *rpy, *self.joints.tolist())
-        qd = (*self.v.tolist(), *ZERO, *self.joint_rates.tolist())
-        without = np.array(model.inverse_dynamics(q, qd, (*ZERO, *ZERO, *swing), True))  # type: ignore[arg-type]
-        a = (given - without[:3]) / mass if self.mass == 1.0 else (given - np.array((0.0, 0.0, mass * G))) / mass
-        tau = np.array(model.inverse_dynamics(q, qd, (*a.tolist(), *ZERO, *swing), True))  # type: ignore[arg-type]
-        tau -= np.array(model.contact_torque(q, (-push, 0.0, 0.0)))  # type: ignore[arg-type]
-        torque = math3.body_torque_from_euler(rpy, (tau[3], tau[4], tau[5]))
+        v, joints, rates = three(self.v), three(self.joints), three(self.joint_rates)
+        turned = np.array(R).reshape(3, 3)
+        drag = -turned @ (np.array(self.config.vehicle.base.drag) * (turned.T @ self.v))
+        given = self.thrust * turned[:, 2] + drag + np.array(wind) + np.array((-push, 0.0, 0.0))
+        q, qd = (*ZERO, *rpy, *joints), (*v, *ZERO, *rates)
+        without = np.array(model.inverse_dynamics(q, qd, (*ZERO, *ZERO, *swing), True))[:3]
+        without[2] += (mass - MASS) * G
+        a = three((given - without) / mass)
+        tau = np.array(model.inverse_dynamics(q, qd, (*a, *ZERO, *swing), True))
+        tau -= np.array(model.contact_torque(q, (-push, 0.0, 0.0)))
+        torque = math3.body_torque_from_euler(rpy, three(tau[3:6]))
         servo = CONFIG.vehicle.servo
-        friction = [
-            servo.friction_viscous * w + servo.friction_static * max(-1.0, min(1.0, w / 0.05))
-            for w in self.joint_rates.tolist()
-        ]
-        current = [servo.stall_current * (x + f) / servo.stall_torque for x, f in zip(tau[6:], friction, strict=True)]
+        friction = servo.friction_viscous * self.joint_rates
+        friction += servo.friction_static * np.clip(self.joint_rates / 0.05, -1.0, 1.0)
+        current = three(servo.stall_current * (tau[6:] + friction) / servo.stall_torque)
         f_B = math3.rotate_transposed(R, (a[0], a[1], a[2] + G))
         seen = (f_B[0] + noise[0], f_B[1] + noise[1], f_B[2] + noise[2])
         x, y, z = math3.rotate(R, seen)
         five = (0.0, 0.0, 0.0, 0.0, 0.0)
         servos = ServoState(
-            0, (*self.joints.tolist(), 0.0, 0.0), (*self.joint_rates.tolist(), 0.0, 0.0), (*current, 0.0, 0.0), five,
-            five, (0, 0, 0, 0, 0), True,
+            0, (*joints, 0.0, 0.0), (*rates, 0.0, 0.0), (*current, 0.0, 0.0), five, five, (0, 0, 0, 0, 0), True,
         )  # fmt: skip
-        vx, vy, vz = self.v.tolist()
         sight = Sight(
-            seen, (x, y, z - G), (vx, vy, vz), 0.0, True, R, ZERO, rpy, ZERO, servos, 0.0, True, ZERO, near, hovering
+            seen, (x, y, z - G), v, 0.0, True, R, ZERO, rpy, ZERO, servos, 0.0, True, ZERO, near, hovering
         )  # fmt: skip
         self.state, self.forces = estimators.step(
-            self.state, sight, Command(self.command, torque), taring, tared, drop and not taring, DERIVED, self.config,
-            DT,
+            self.state, sight, Command(self.command, torque), taring, tared, not taring, DERIVED, self.config, DT,
         )  # fmt: skip
-        self.v += DT * a
+        self.v += DT * np.array(a)
         self.joints += DT * self.joint_rates
         self.joint_rates += DT * np.array(swing)
-        self.t += DT
         return self.forces
 
     def hover(self, seconds: float = 5.0, bias: Vec3 = ZERO) -> None:
         """Held where it is, calibrated and tared; the vehicle's own velocity stays what it is."""
-        n = round(seconds / DT)
-        for _ in range(n):
+        for _ in range(250):
+            self.tick(near=False, noise=bias)
+        for _ in range(round(seconds / DT)):
             self.tick(near=False, hovering=True, noise=bias)
         for k in range(250):
             self.tick(near=False, taring=True, tared=k == 249, noise=bias)
@@ -118,6 +108,11 @@ class Craft:
             if lean:
                 self.command = float(np.hypot(f, MASS * self.mass * G)) / self.share
             yield f, self.tick(f, pitch=pitch)
+
+
+def three(values: NDArray[np.float64]) -> Vec3:
+    x, y, z = values.tolist()
+    return (x, y, z)
 
 
 def read(forces: Forces, name: str) -> float:
@@ -172,6 +167,16 @@ def test_where_there_is_no_force_none_is_read() -> None:
         assert abs(forces.felt) < 0.02
 
 
+def test_the_drag_of_the_vehicle_s_own_speed_is_no_force() -> None:
+    craft = Craft(load_config("paper"))
+    craft.v[:] = (1.0, 0.5, -0.5)
+    for _ in range(500):
+        forces = craft.tick(near=False)
+    assert math3.norm(forces.paper.force_W) > 0.1, "it knows of none"
+    for name in ("body", "momentum", "kalman"):
+        assert getattr(forces, name).force_W == pytest.approx(ZERO, abs=0.02), name
+
+
 def test_the_swinging_arm_is_no_force_to_the_one_that_knows_it() -> None:
     craft = Craft()
     worst = dict.fromkeys(NAMES, 0.0)
@@ -181,8 +186,8 @@ def test_the_swinging_arm_is_no_force_to_the_one_that_knows_it() -> None:
         for name in NAMES:
             worst[name] = max(worst[name], math3.norm(getattr(forces, name).force_W))
     assert worst["momentum"] < 0.03
-    assert worst["paper"] > 0.2
-    assert worst["body"] > 0.2
+    assert worst["paper"] > 0.1
+    assert worst["body"] > 0.1
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -259,7 +264,7 @@ def test_the_lag_of_the_motors_is_in_the_model() -> None:
         for name in NAMES:
             worst[config is lagging, name] = max(abs(getattr(forces, name).force_W[2]) for forces in seen)
     for name in NAMES:
-        assert worst[False, name] > 0.8, name
+        assert worst[False, name] > 0.4, name
         assert worst[True, name] < 0.05, name
 
 
@@ -283,7 +288,7 @@ def test_an_absurd_sample_does_not_stay(value: float) -> None:
     for _ in range(1500):
         forces = craft.tick()
     for name in ("body", "momentum", "kalman"):
-        assert all(map(isfinite, getattr(forces, name).force_W)), name
+        assert getattr(forces, name).force_W == pytest.approx(ZERO, abs=0.02), name
 
 
 @given(st.lists(st.tuples(*[st.floats(-50.0, 50.0)] * 3), min_size=1, max_size=30), st.booleans())
@@ -334,8 +339,8 @@ def test_the_torque_is_found_from_the_current_of_the_supply(torque: float, rate:
     """Back from what a servo that drives shows: motor current times duty cycle."""
     servo = CONFIG.vehicle.servo
     share, speed = torque / servo.stall_torque, rate / servo.no_load_speed
-    if share * (share + speed) < 0.0 or abs(share + speed) > 1.0:
-        return  # braking, or beyond what the supply can give
+    if (share * speed < 0.0 and abs(share) < 1.3 * abs(speed)) or abs(share + speed) > 1.0:
+        return  # braking, where two torques draw the same current, or beyond what the supply can give
     current = servo.stall_current * share * abs(share + speed)
     quiet = replace(servo, friction_static=0.0, friction_viscous=0.0)
     assert momentum_observer.servo_torque(current, rate, quiet, True) == pytest.approx(torque, abs=1e-6)
@@ -388,9 +393,9 @@ def test_the_unscented_filter_reads_a_known_force() -> None:
     force: Vec3 = ZERO
     for k in range(700):
         push = 0.0 if k < 300 else 1.5
-        v = (float(craft.v[0]), float(craft.v[1]), float(craft.v[2]))
+        v = three(craft.v)
         craft.tick(push)
-        f_B = (-push / MASS + -CONFIG.vehicle.base.drag[0] * v[0] / MASS, 0.0, G)
+        f_B = (-push / MASS, 0.0, G)
         if started is None:
             started = Ukf(MASS, G, v, ZERO)
         force = started.step(MASS * G, f_B, ZERO, ZERO, v, math3.matrix_from_euler(ZERO), DT)
