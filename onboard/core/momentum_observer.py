@@ -8,7 +8,7 @@ joints. No acceleration is differentiated and the arm's reaction on the base is 
 (De Luca and Mattone, ICRA 2005; for aerial manipulators Tomic et al., IJRR 2017.)
 
 The velocity is that of the tracker at low frequencies and the integral of the accelerometer above them
-(``velocity_gain``): the tracker's noise alone, times mass and gain, would be a tenth of a newton. The rows of the Euler
+(``velocity_gain``): the noise of the tracker alone, times mass and gain, would be half a newton. The rows of the Euler
 angles are zero when the autopilot is not sent torques: its own loops are not known.
 
 The rows of the joints see what acts on the tip, and no wind on the base: ``felt`` is the force at the tip in the arm's
