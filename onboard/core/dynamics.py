@@ -57,6 +57,11 @@ class Model:
         variant = self._variants[payload]
         return _inverse_dynamics(q, qd, qdd, variant.parts, variant.turning)
 
+    def momentum(self, q: Nine, qd: Nine, payload: bool) -> tuple[Nine, Nine]:
+        """Generalised momentum p = M qd, and C^T qd - G: what p' is beside the generalised forces."""
+        variant = self._variants[payload]
+        return _momentum(q, qd, variant.parts, variant.turning)
+
     def contact_torque(self, q: Nine, force_W: Vec3) -> Nine:
         """J_tip^T F: generalised forces of a force (N, W) that acts on the gripper's tip."""
         return _contact_torque(q, force_W, self._tip)
@@ -311,3 +316,19 @@ def _mass_and_coriolis(q: Nine, qd: Nine, parts: Array, turning: Array) -> tuple
     for i in range(6, 9):
         mass[i, i] += turning[4, 0]
     return mass, coriolis
+
+
+@compiled("UniTuple(UniTuple(f8, 9), 2)(UniTuple(f8, 9), UniTuple(f8, 9), f8[:, ::1], f8[:, ::1])")
+def _momentum(q: Nine, qd: Nine, parts: Array, turning: Array) -> tuple[Nine, Nine]:
+    mass, coriolis = _mass_and_coriolis(q, qd, parts, turning)
+    g = _inverse_dynamics(q, _REST, _REST, parts, turning)
+    p, d = np.zeros(9), np.zeros(9)
+    for i in range(9):
+        for j in range(9):
+            p[i] += mass[i, j] * qd[j]
+            d[i] += coriolis[j, i] * qd[j]
+    return (
+        (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8]),
+        (d[0] - g[0], d[1] - g[1], d[2] - g[2], d[3] - g[3], d[4] - g[4], d[5] - g[5], d[6] - g[6], d[7] - g[7],
+         d[8] - g[8]),
+    )  # fmt: skip
