@@ -14,7 +14,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from drivers.samples import AutopilotState, Odometry, ServoState, Vec3
-from onboard.core import contact_trigger, estimators, kinematics, math3
+from onboard.core import contact_trigger, estimators, kinematics, math3, plan
 from onboard.core.derived import Derived
 from onboard.core.guidance import Progress
 from onboard.core.kinematics import Tool
@@ -35,6 +35,9 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     extrapolate_max: Annotated[
         float, spec("s", 0.0, 0.2, "position is carried forward by velocity for at most this age")
     ] = 0.06
+    jump: Annotated[
+        float, spec("m", 0.003, 1.0, "a step of the tracker beyond what its velocity explains from which it is no motion")
+    ] = 0.01
     released_at: Annotated[
         float, spec("rad", -3.14, 3.14, "measured gripper angle beyond which the sleeve is gone")
     ] = 0.8
@@ -90,7 +93,7 @@ def step(
             jump = hypot(*leap)
             reset = new.reset_counter != odometry.reset_counter
             brief = new.t_ns - odometry.t_ns <= params.estimate.extrapolate_max * 1e9
-            if brief and phase is not Phase.PREFLIGHT and (reset or jump > params.safety.odometry_jump):
+            if brief and phase is not Phase.PREFLIGHT and (reset or jump > params.estimate.jump):
                 shift = (shift[0] - leap[0], shift[1] - leap[1], shift[2] - leap[2])
             odometry = new
     told = inputs.autopilot
@@ -140,13 +143,17 @@ def step(
     )
 
     tip = kinematics.tip_W(vehicle.arm, p, R, joints, Tool.NEEDLE if phase is Phase.ADHESIVE else Tool.GRIPPER)
-    at_pipe, crack = phase in NEAR_PIPE, site.crack
-    distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
+    at_pipe, crack = phase in NEAR_PIPE or progress.feeling, plan.found(site, progress.along).crack
+    if progress.feeling:  # what lies ahead of the tip is what is looked for
+        n = site.normal
+        distance = hypot((tip[0] - crack[0]) * n[1] - (tip[1] - crack[1]) * n[0], tip[2] - crack[2])
+    else:
+        distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
     rpy_rate = math3.euler_rates_from_body(rpy, w)
     sight = estimators.Sight(
         autopilot.f_B, acceleration, v, ahead, odometry is not state.odometry, R, p, rpy, rpy_rate, servos, ages[2],
         payload, reference.a if reference is not None else _O, at_pipe and distance < params.estimators.gate,
-        progress.arrived and not at_pipe,
+        (progress.arrived or progress.taring) and not at_pipe,
     )  # fmt: skip
     dropped = not progress.tare_begun
     watched, forces = estimators.step(

@@ -136,7 +136,7 @@ def step(
     )
     return (
         State(thrust, paper, body, momentum, kalman, tares, joints, felt),
-        Forces(*seen, _along(felt, n), thrust.scale),
+        Forces(*seen, _along(felt, n), math3.subtract(kalman.force, kalman.contact), thrust.scale),
     )
 
 

@@ -117,7 +117,7 @@ def for_mission(
     grounded = told is not None and told.landed is Landed.ON_GROUND
     site = derived.site
     crack, tip, n = site.crack, believed.tip_W, site.normal
-    beyond = (tip[0] - crack[0]) * n[0] + (tip[1] - crack[1]) * n[1]
+    beyond = (tip[0] - crack[0]) * n[0] + (tip[1] - crack[1]) * n[1] - progress.along
     adrift = believed.age_autopilot > params.safety.autopilot_lost
     return mission.Facts(
         ready=believed.valid and grounded and not armed and not verdict.reasons,
@@ -131,8 +131,8 @@ def for_mission(
         landed=grounded and not flying,
         disarmed=not armed,
         in_contact=believed.in_contact,
-        contact_lost=phase is Phase.PRESS and not believed.in_contact,
-        overtravel=phase is Phase.ADVANCE and beyond > params.plan.overtravel,
+        contact_lost=phase is Phase.PRESS and not believed.in_contact and progress.lost,
+        overtravel=progress.missed or (phase is Phase.ADVANCE and beyond > params.plan.overtravel),
         blind=safety.blind(verdict),
         offboard_lost=safety.yielded(verdict),
         payload=believed.payload,

@@ -533,7 +533,7 @@ TABLE: Final[tuple[Row, ...]] = (
     Row((P.TOOL_CHANGE,), _FACTS, arrived, P.TARE, "tare"),
     Row((P.TARE,), _FACTS, tared, P.ADVANCE, "advance"),
     Row((P.ADVANCE,), _FACTS, triggered, P.PRESS, "press"),
-    Row((P.ADVANCE,), _FACTS, overtravel, P.RETREAT_HOLD, "no_contact", _GIVE_UP),
+    Row((P.ALIGN, P.ADVANCE), _FACTS, overtravel, P.RETREAT_HOLD, "no_contact", _GIVE_UP),
     Row((P.ADVANCE,), _FACTS, late, P.RETREAT_HOLD, "no_contact", _GIVE_UP),
     Row((P.PRESS,), _FACTS, lost_again, P.TARE, "press_again"),
     Row((P.PRESS,), _FACTS, lost_for_good, P.RETREAT_HOLD, "press_given_up", _GIVE_UP),
