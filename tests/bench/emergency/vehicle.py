@@ -25,6 +25,7 @@ from msgspec.structs import replace
 
 from drivers.dynamixel import Dynamixel
 from drivers.dynamixel_settings import DynamixelSettings
+from drivers.mailbox import Notices
 from drivers.px4 import Px4, Px4Settings
 from drivers.samples import (
     AutopilotCommand,
@@ -102,7 +103,7 @@ class Rig:
         Thread(target=self._renew, name="renew", daemon=True).start()
 
     def _new(self) -> Emergency:
-        emergency = Emergency(self._px4, self._bus, self._request, lambda: self.ticked_ns)
+        emergency = Emergency(self._px4, self._bus, self._request, lambda: self.ticked_ns, Notices())
         emergency.start()
         return emergency
 
