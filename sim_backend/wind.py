@@ -100,7 +100,7 @@ class Wind:
         self._cos, self._sin = cos(heading), sin(heading)
         self._mean = params.mean
         self._next_ns = 0
-        self._filters: tuple[_First, _Second, _Second] | None = None
+        self._filters: tuple[_First | _Second, ...] = ()
         if params.gusts:
             (lu, lv, lw), (su, sv, sw) = scales(params)
             start = self._random.standard_normal(6).tolist()
@@ -115,7 +115,7 @@ class Wind:
 
     def until(self, t_ns: int) -> Vec3:
         """Velocity of the air at this time of the world, m/s, W; it never goes back."""
-        if self._filters is not None:
+        if self._filters:
             while self._next_ns <= t_ns:
                 noise = self._random.standard_normal(6).tolist()
                 for k, each in enumerate(self._filters):
@@ -126,7 +126,7 @@ class Wind:
 
     def _turned(self) -> Vec3:
         u = v = w = 0.0
-        if self._filters is not None:
+        if self._filters:
             u, v, w = (each.value for each in self._filters)
         u += self._mean
         return (self._cos * u - self._sin * v, self._sin * u + self._cos * v, w)

@@ -30,6 +30,10 @@ RARE = {
 }  # fmt: skip
 
 
+#: Between two looks at the devices, s: within the period of each.
+LOOK = 0.002
+
+
 def leaves(values: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in values.items():
         if isinstance(value, dict):
@@ -65,11 +69,11 @@ def flown(where: World, seconds: float = 1.2) -> list[object]:
     """What the devices tell in a jump into the air, and how the world went."""
     autopilot, weight = MockAutopilot(where), 2.5 * 9.81
     told: list[object] = []
-    for k in range(round(seconds / 0.004)):
-        lift = weight * (1.1 if k % 50 < 25 else 1.3)
+    for k in range(round(seconds / LOOK)):
+        lift = weight * (1.1 + 0.02 * (k % 11))
         zero = (0.0, 0.0, 0.0)
         autopilot.command(AutopilotCommand(Engage.OFFBOARD, Interface.ATTITUDE, lift, zero, (1.0, 0.0, 0.0, 0.0), zero))
-        where.advance(0.004)
+        where.advance(LOOK)
         told.append(look(where))
     return told
 
