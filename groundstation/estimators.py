@@ -95,7 +95,9 @@ def delay(estimate: Array, truth: Array, period: float) -> float | None:
         return None
     most = min(round(_LONGEST / period), len(b) // 2)
     n = len(b) - most
-    found = np.array([np.dot(a[lag : lag + n], b[:n]) for lag in range(most + 1)])
+    # each window of the estimate by its own size: else the lag that reaches its largest change would win
+    size = np.sqrt(np.convolve(a * a, np.ones(n), "valid"))
+    found = np.array([np.dot(a[lag : lag + n], b[:n]) for lag in range(most + 1)]) / np.maximum(size, 1e-12)
     at = int(np.argmax(found))
     if 0 < at < most:  # between the samples, by the parabola through the three highest
         left, top, right = found[at - 1 : at + 2]

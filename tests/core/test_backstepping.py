@@ -32,11 +32,12 @@ def law(
     adapt: bool = True,
     hold: bool = False,
     force: float = 0.0,
+    wind: Vec3 = ZERO,
     params: Params = PRINTED,
 ) -> tuple[State, Vec3, Vec3]:
     normal = (cos(heading), sin(heading))
     return backstepping.step(
-        state, error, rate, acceleration, MASS, WEIGHT, normal, contact, adapt, hold, force, params, DT
+        state, error, rate, acceleration, MASS, WEIGHT, normal, contact, adapt, hold, force, wind, params, DT
     )
 
 

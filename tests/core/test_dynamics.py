@@ -298,6 +298,9 @@ def test_momentum_and_what_changes_it(vehicle: Vehicle, payload: bool) -> None:
     for q, qd, _ in states(11)[:10]:
         p, drift = model.momentum(nine(q), nine(qd), payload)
         assert p == pytest.approx(model.mass_matrix(nine(q), payload) @ qd, abs=1e-9)
+        assert drift == pytest.approx(
+            model.coriolis(nine(q), nine(qd), payload).T @ qd - np.array(model.gravity(nine(q), payload)), abs=1e-9
+        )
         for i in range(9):
             aside = np.zeros(9)
             aside[i] = 1e-6

@@ -16,13 +16,14 @@ from onboard.logfile import LogError, LogReader
 from onboard.recompute import recompute
 from onboard.records import RunInfo
 from onboard.simulate import simulate
+from tests.sim_backend.noisy import NOISY_SET
 from tests.synthetic import record
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first seconds of a flight with sensors that are not ideal."""
-    config = load_config("paper", sets=["world.sensors.ideal=false", "world.plant.ideal_motors=false"], seed=3)
+    config = load_config("paper", sets=[NOISY_SET, "world.plant.ideal_motors=false"], seed=3)
     path = tmp_path_factory.mktemp("run") / "log.mcap"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulating, "LONGEST", 8.0)
