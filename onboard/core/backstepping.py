@@ -13,9 +13,9 @@ position loop along the contact normal becomes a second force controller that fi
 replaces its stiffness and damping there. And Xi winds up against the wall: it is bounded and leaks always,
 ``freeze_in_contact`` stops it along the normal, and ``rest_in_contact`` across it too, where friction holds the tip.
 
-The integral action is slow. ``wind`` leans against what the Kalman filter observes as disturbance, the contact apart, at
-once. In contact this is the integral action of the force loop: the thrust's horizontal part that is not felt at the
-tip is taken for wind, and made up for.
+The integral action is slow. ``wind`` leans against what the Kalman filter observes as disturbance, the contact apart,
+at once. In contact this is the integral action of the force loop: the thrust's horizontal part that is not felt at
+the tip is taken for wind, and made up for.
 """
 
 from __future__ import annotations

@@ -36,7 +36,8 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
         float, spec("s", 0.0, 0.2, "position is carried forward by velocity for at most this age")
     ] = 0.06
     jump: Annotated[
-        float, spec("m", 0.003, 1.0, "a step of the tracker beyond what its velocity explains from which it is no motion")
+        float,
+        spec("m", 0.003, 1.0, "a step of the tracker beyond what its velocity explains from which it is no motion"),
     ] = 0.01
     released_at: Annotated[
         float, spec("rad", -3.14, 3.14, "measured gripper angle beyond which the sleeve is gone")

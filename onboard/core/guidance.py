@@ -68,7 +68,10 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
         1.0
     )
     seek_time: Annotated[
-        float, spec("s", 0.0, 10.0, "contact lost in the press: looked for at once and for so long; 0: never", in_flight=False)
+        float,
+        spec(
+            "s", 0.0, 10.0, "contact lost in the press: looked for at once and for so long; 0: never", in_flight=False
+        ),
     ] = 0.0
     seek_speed: Annotated[float, spec("m/s", 0.002, 0.1, "speed with which it is looked for")] = 0.02
     stop_acceleration: Annotated[float, spec("m/s^2", 0.1, 3.0, "mean deceleration of a broken-off motion")] = 0.5
@@ -213,7 +216,9 @@ def step(
         seeking = -1.0
     leg = state.legs[state.index] if state.index < len(state.legs) else None
     if leg is not None and leg.feeling and estimate.in_contact:
-        state = replace(_start_from(state, _base_measured(state.at, estimate)), along=_along(estimate, derived), felt=True)
+        state = replace(
+            _start_from(state, _base_measured(state.at, estimate)), along=_along(estimate, derived), felt=True
+        )
         site = plan.found(derived.site, state.along)
         state = replace(state, legs=_plan(phase, state, site, params))
 

@@ -40,20 +40,20 @@ class Realistic:
 
 
 @pytest.fixture(scope="session")
-def _realistic() -> Realistic:
+def realistic() -> Realistic:
     return Realistic()
 
 
 @pytest.fixture
-def pressing(_realistic: Realistic) -> Flight:
+def pressing(realistic: Realistic) -> Flight:
     """Pressing with 2.5 N."""
-    return _realistic.press.copy()
+    return realistic.press.copy()
 
 
 @pytest.fixture
-def advancing(_realistic: Realistic) -> Flight:
+def advancing(realistic: Realistic) -> Flight:
     """On the last centimetres to the pipe."""
-    return _realistic.advance.copy()
+    return realistic.advance.copy()
 
 
 class Contact:
@@ -110,8 +110,8 @@ def released(contact: Contact, peak: float) -> None:
     assert contact.peak < peak
 
 
-def test_a_pipe_nearer_than_believed_is_found_by_touch(_realistic: Realistic) -> None:
-    flight = _realistic.advance
+def test_a_pipe_nearer_than_believed_is_found_by_touch(realistic: Realistic) -> None:
+    flight = realistic.advance
     assert flight.world.deviations.pipe[0] == -NEARER
     assert flight.state.guidance.along == pytest.approx(-NEARER, abs=0.02)
     assert flight.from_pipe - NEARER > 0.02  # and the gripper waits clear of where the pipe really is
