@@ -11,7 +11,8 @@ integral action Xi. Signs: a base ahead of its reference (e1 > 0) is pushed back
 Two things that the printed law lacks, off unless asked for. In contact the pipe holds the base, so the
 position loop along the contact normal becomes a second force controller that fights the first: ``compliant``
 replaces its stiffness and damping there. And Xi winds up against the wall: it is bounded and leaks always,
-``freeze_in_contact`` stops it along the normal, and ``rest_in_contact`` across it too, where friction holds the tip.
+``freeze_in_contact`` stops it along the normal, and from a force of ``grip`` on across it too, where friction holds
+the tip and hides the wind.
 
 The integral action is slow. ``wind`` leans against what the Kalman filter observes as disturbance, the contact apart,
 at once. In contact this is the integral action of the force loop: the thrust's horizontal part that is not felt at
@@ -47,9 +48,9 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
         float, spec("1/s^2", 0.0, 20.0, "stiffness per mass along the normal in contact", in_flight=False)
     ] = 0.3
     contact_damping: Annotated[float, spec("1/s", 0.0, 20.0, "damping per mass along the normal in contact")] = 1.2
-    rest_in_contact: Annotated[bool, note("no adaptation across the normal either while the force loop is closed")] = (
-        False
-    )
+    grip: Annotated[
+        float, spec("N", 0.0, 100.0, "desired force from which friction holds the tip: no adaptation across the normal")
+    ] = 100.0
     wind: Annotated[float, spec("1", 0.0, 1.0, "share of the observed horizontal wind that is leant against")] = 0.0
     wind_bandwidth: Annotated[float, spec("rad/s", 0.05, 20.0, "with which that is done")] = 2.0
     feed_forward: Annotated[
@@ -115,7 +116,8 @@ def step(
             e2y -= along * ny
         dx, dy, dz = state.disturbance
         keep = 1.0 - p.leak * dt
-        if p.rest_in_contact and contact > 0.0:
+        gripped = contact > 0.0 and force >= p.grip
+        if gripped:
             e2x = e2y = e2z = 0.0
         b = p.bound
         state = State(
@@ -124,7 +126,7 @@ def step(
                 min(b, max(-b, keep * dy - p.beta * e2y * dt)),
                 min(b, max(-b, keep * dz - p.beta_z * e2z * dt)),
             ),
-            _leant(state.wind, wind, normal, contact, p, dt) if p.wind > 0.0 else state.wind,
+            _leant(state.wind, wind, normal, gripped, p, dt) if p.wind > 0.0 else state.wind,
         )
     dx, dy, dz = state.disturbance
     if p.wind > 0.0:
@@ -138,13 +140,13 @@ def step(
 
 
 def _leant(
-    old: tuple[float, float], wind: Vec3, normal: tuple[float, float], contact: float, params: Params, dt: float
+    old: tuple[float, float], wind: Vec3, normal: tuple[float, float], gripped: bool, params: Params, dt: float
 ) -> tuple[float, float]:
     """The wind, low-pass filtered. While the pipe holds the tip, friction across the normal would be taken for it."""
     w = params.wind_bandwidth * dt
     share, b = w / (1.0 + w), params.bound
     cx, cy = share * (wind[0] - old[0]), share * (wind[1] - old[1])
-    if contact > 0.0:
+    if gripped:
         nx, ny = normal
         along = cx * nx + cy * ny
         cx, cy = along * nx, along * ny

@@ -145,9 +145,8 @@ def step(
 
     tip = kinematics.tip_W(vehicle.arm, p, R, joints, Tool.NEEDLE if phase is Phase.ADHESIVE else Tool.GRIPPER)
     at_pipe, crack = phase in NEAR_PIPE or progress.feeling, plan.found(site, progress.along).crack
-    if progress.feeling:  # what lies ahead of the tip is what is looked for
-        n = site.normal
-        distance = hypot((tip[0] - crack[0]) * n[1] - (tip[1] - crack[1]) * n[0], tip[2] - crack[2])
+    if progress.feeling:  # how far it is ahead is what is looked for, and the pipe is long
+        distance = abs(tip[2] - crack[2])
     else:
         distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
     rpy_rate = math3.euler_rates_from_body(rpy, w)

@@ -383,9 +383,12 @@ def _press(state: State, estimate: Estimate, derived: Derived, params: AllParams
 def _seek(state: State, estimate: Estimate, site: Site, params: AllParams) -> State:
     """The state with the tip on its way back to the pipe, from where the vehicle is."""
     state = _start_from(state, _base_measured(state.at, estimate))
-    speed, n = params.guidance.seek_speed, site.normal
+    speed, (nx, ny) = params.guidance.seek_speed, site.normal
     way = speed * (params.guidance.seek_time + SMOOTH_START)
-    return replace(state, legs=(_uniform(state.at, (way * n[0], way * n[1], 0.0), speed),))
+    aside = (site.crack[0] - state.at[0]) * -ny + (site.crack[1] - state.at[1]) * nx  # back to the crack's middle
+    leg = _uniform(state.at, (way * nx, way * ny, 0.0), speed)
+    x, y, *rest = leg.target
+    return replace(state, legs=(replace(leg, target=(x - aside * ny, y + aside * nx, *rest)),))
 
 
 def _along(estimate: Estimate, derived: Derived) -> float:
