@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from onboard.core.params import Params as AllParams
 
 NEAR_PIPE = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE)
+#: On the way out of contact.
+LEAVING = (Phase.ALIGN, Phase.TARE, Phase.RETREAT, Phase.RETREAT_HOLD, Phase.RETREAT_LAND)
 ON_GROUND = (Phase.PREFLIGHT, Phase.ARMED, Phase.STOPPED)
 FREE_FLIGHT = (Phase.APPROACH, Phase.ALIGN, Phase.ADHESIVE, Phase.TOOL_CHANGE, Phase.TARE, Phase.RETURN, Phase.HOLD)
 
@@ -65,6 +67,8 @@ class State(Struct, frozen=True, gc=False):
     """What takes a position of the tracker back into the frame it had before it jumped, m."""
     alarm: contact_trigger.State = contact_trigger.State()
     """Away from the pipe: the trigger, as if the tip were at the crack."""
+    near: bool = False
+    """There may be contact: the gate of the estimators is open."""
 
 
 def step(
@@ -120,7 +124,7 @@ def step(
         estimate = _nothing(state.payload, ages)
         waiting = State(
             odometry, autopilot, servos, state.forces, state.trigger, state.payload,
-            finite, jump, reset, disagreement, shift, state.alarm,
+            finite, jump, reset, disagreement, shift, state.alarm, state.near,
         )  # fmt: skip
         return waiting, estimate
 
@@ -150,9 +154,14 @@ def step(
     else:
         distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
     rpy_rate = math3.euler_rates_from_body(rpy, w)
+    near = distance < params.estimators.gate
+    if not at_pipe:  # whoever leaves the pipe touches it for a while yet: what presses then is no wind to lean against
+        n = site.normal
+        clear = (crack[0] - tip[0]) * n[0] + (crack[1] - tip[1]) * n[1]
+        near = state.near and phase in LEAVING and clear < 0.5 * params.estimators.gate
     sight = estimators.Sight(
         autopilot.f_B, acceleration, v, ahead, odometry is not state.odometry, R, p, rpy, rpy_rate, servos, ages[2],
-        payload, reference.a if reference is not None else _O, at_pipe and distance < params.estimators.gate,
+        payload, reference.a if reference is not None else _O, near,
         (progress.arrived or progress.taring) and not at_pipe,
     )  # fmt: skip
     dropped = not progress.tare_begun
@@ -185,7 +194,7 @@ def step(
         x, y, z = math3.vertical(odometry.q_WB)
         disagreement = acos(min(1.0, max(-1.0, x * R[6] + y * R[7] + z * R[8])))
     return State(
-        odometry, autopilot, servos, watched, trigger, payload, finite, jump, reset, disagreement, shift, alarm
+        odometry, autopilot, servos, watched, trigger, payload, finite, jump, reset, disagreement, shift, alarm, near
     ), estimate
 
 
