@@ -40,6 +40,8 @@ SMOOTH_START = 1.0
 LAST_DESCENT = 0.35
 #: The advance goes on this far past the overtravel that ends it, m.
 BEYOND = 0.02
+#: Contact that is lost is looked for from no farther ahead of the vehicle, m.
+NOT_FAR = 0.03
 #: An estimate this long (s) after the retreat has begun tells whether there is contact.
 SHORTEST_EASE = 0.05
 #: Touched down: the reference is this far below the vehicle (m), which sinks no faster than this (m/s).
@@ -381,11 +383,13 @@ def _press(state: State, estimate: Estimate, derived: Derived, params: AllParams
 
 
 def _seek(state: State, estimate: Estimate, site: Site, params: AllParams) -> State:
-    """The state with the tip on its way back to the pipe, from where the vehicle is."""
-    state = _start_from(state, _base_measured(state.at, estimate))
-    speed, (nx, ny) = params.guidance.seek_speed, site.normal
+    """The state with the tip on its way back to the pipe, which is where it was felt last."""
+    tip, (nx, ny), at = estimate.tip_W, site.normal, _base_measured(state.at, estimate)
+    gap = min(NOT_FAR, max(0.0, (site.crack[0] - tip[0]) * nx + (site.crack[1] - tip[1]) * ny))
+    state = _start_from(state, (at[0] + gap * nx, at[1] + gap * ny, *at[2:]))
+    speed = params.guidance.seek_speed
     way = speed * (params.guidance.seek_time + SMOOTH_START)
-    aside = (site.crack[0] - state.at[0]) * -ny + (site.crack[1] - state.at[1]) * nx  # back to the crack's middle
+    aside = (site.crack[0] - at[0]) * -ny + (site.crack[1] - at[1]) * nx  # back to the crack's middle
     leg = _uniform(state.at, (way * nx, way * ny, 0.0), speed)
     x, y, *rest = leg.target
     return replace(state, legs=(replace(leg, target=(x - aside * ny, y + aside * nx, *rest)),))
