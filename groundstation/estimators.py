@@ -136,7 +136,7 @@ def rows(told: dict[str, Any]) -> list[tuple[str, list[str]]]:
     return shown
 
 
-HEADINGS = ("RMSE, N", "bias, N", "spread, N", "delay, ms", "free flight, N", "a tick, us")
+HEADINGS = ("RMSE, N", "bias, N", "spread, N", "delay, ms", "free, N", "a tick, us")
 
 
 def words(told: dict[str, Any]) -> str:

@@ -88,5 +88,5 @@ def run(options: argparse.Namespace) -> int:
     assert table is not None
     console = Console(highlight=False)
     console.print(terminal.side_by_side(table))
-    console.print(estimators.words(table), soft_wrap=True, markup=False)
+    console.print(estimators.words(table), markup=False)
     return DONE

@@ -55,7 +55,7 @@ def summarize(
     console.print(side)
     if metrics["estimators"] is not None:
         console.print(side_by_side(metrics["estimators"]))
-        console.print(estimators.words(metrics["estimators"]) + "\n", soft_wrap=True, markup=False)
+        console.print(estimators.words(metrics["estimators"]) + "\n", markup=False)
     others = Table(box=None, show_header=False, pad_edge=False)
     for figure in table.figures(metrics, run.config.repair.force):
         others.add_row(figure.label, figure.value, _MARKS[figure.good], figure.detail)
