@@ -15,8 +15,7 @@ replaces its stiffness and damping there. And Xi winds up against the wall: it i
 the tip and hides the wind.
 
 The integral action is slow. ``wind`` leans against what the Kalman filter observes as disturbance, the contact apart,
-at once. In contact this is the integral action of the force loop: the thrust's horizontal part that is not felt at
-the tip is taken for wind, and made up for.
+within half a second, and in contact too: there a gust is what the accelerometer feels and the tip does not.
 """
 
 from __future__ import annotations
