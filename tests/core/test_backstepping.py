@@ -32,8 +32,8 @@ def law(
     adapt: bool = True,
     hold: bool = False,
     force: float = 0.0,
-    wind: Vec3 = ZERO,
     params: Params = PRINTED,
+    wind: Vec3 = ZERO,
 ) -> tuple[State, Vec3, Vec3]:
     normal = (cos(heading), sin(heading))
     return backstepping.step(

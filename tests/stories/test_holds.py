@@ -101,12 +101,12 @@ class Gust:
         return (x + share * self._speed[0], y + share * self._speed[1], z + share * self._speed[2])
 
 
-def released(contact: Contact, peak: float) -> None:
+def released(contact: Contact, peak: float, lost: float = RECOVERED) -> None:
     """The repair goes on: contact is regained in time, the force stays bounded, the sleeve ends on the pipe."""
     contact.until(Phase.RETREAT, within=60.0)
     assert contact.flight.truth.sleeve_on_pipe
     assert contact.flight.truth.crashed == ""
-    assert contact.longest < RECOVERED
+    assert contact.longest < lost
     assert contact.peak < peak
 
 
@@ -160,7 +160,8 @@ def test_the_tip_slips_off(pressing: Flight) -> None:
 @pytest.mark.parametrize("towards", [1.0, -1.0], ids=["onto the pipe", "off the pipe"])
 def test_a_gust_of_five_metres_a_second(pressing: Flight, towards: float) -> None:
     pressing.world.wind = Gust(pressing.world.wind, pressing.world.time, (5.0 * towards, 0.0, 0.0))  # type: ignore[assignment]
-    released(Contact(pressing), peak=12.0)
+    # blown off too far to be found at once, it backs off and presses again
+    released(Contact(pressing), peak=20.0, lost=RECOVERED + 0.5)
 
 
 @pytest.mark.parametrize("jump", [0.1, 0.3])
@@ -180,7 +181,7 @@ def test_one_servo_goes_limp(pressing: Flight, joint: int) -> None:
     limp: Limp = tuple(k == joint for k in range(5))  # type: ignore[assignment]
     world = pressing.world
     given = world.command_servos
-    world.command_servos = lambda command, _=None: given(command, limp)  # type: ignore[method-assign,misc,assignment]
+    world.command_servos = lambda command, _=None: given(command, limp)  # type: ignore[method-assign,assignment]
     contact = Contact(pressing).until(Phase.HOLD, Phase.LAND, Phase.STOPPED, within=40.0)
     assert contact.peak < 15.0
     assert pressing.truth.crashed == ""
