@@ -30,8 +30,8 @@ from tests.stories.flight import PERIOD, Flight
 
 SETS = ("world.wind.mean=0", "world.wind.gusts=0", "plan.arc_max=0.2", "repair.hold=30")
 INTERFACES = ("attitude", "body_rate")
-GAINS = (0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 2.5, 3.0, 4.0)
-DELAYS = (0, 5, 10, 15, 20, 25, 30, 40, 50)
+GAINS = (0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 2.3, 2.6, 3.0, 4.0)
+DELAYS = (0, 3, 6, 9, 12, 15, 18, 21)
 #: Ticks.
 TRIAL, JUDGED = 2000, 1000
 #: A force that swings more (standard deviation, N), or a contact that breaks, is no hold.

@@ -15,8 +15,8 @@ wins.
   was interrupted beside the pipe, to what is done there. Whoever is not clear of the pipe retreats first.
 - ARMED is on the ground: whatever breaks it off leads through LAND, which disarms, as a takeoff broken off does.
 - Lost contact in PRESS goes back to TARE (the reference backs off, the observer is tared anew) and presses again;
-  after ``max_attempts`` of these, or when ADVANCE finds no contact in time or in reach, the mission gives up: it
-  retreats, returns and lands, and does not count as completed.
+  after ``max_attempts`` of these, or when ADVANCE (or ALIGN, feeling for the pipe) finds no contact in reach, the
+  mission gives up: it retreats, returns and lands, and does not count as completed.
 - The autopilot lands by itself (``State.autoland``) when the position is lost or LAND takes too long. Once it has
   left offboard by itself, or a pilot has taken it (``State.yielded``), nothing is asked of it any more but KILL.
 """
