@@ -117,6 +117,9 @@ def _parser() -> argparse.ArgumentParser:
         "sim", help=words, description=words.capitalize() + ".", epilog=_SIM_EPILOG, formatter_class=raw
     )
     sim.add_argument("--scenario", metavar="NAME|FILE", help="where the pipe is and what to do (default: paper)")
+    sim.add_argument(
+        "--longest", type=float, metavar="SECONDS", help="break off after so much simulated time (default: 900)"
+    )
     sim.set_defaults(run=_sim)
     words = "fly it in real time, real drivers against emulated devices"
     desk = commands.add_parser(
@@ -234,8 +237,10 @@ def _common(options: argparse.Namespace) -> list[str]:
 
 def _run_options(options: argparse.Namespace) -> list[str]:
     duration = getattr(options, "duration", None)
+    longest = getattr(options, "longest", None)
     quiet = ["--no-progress"] if options.no_progress else []
-    return [*quiet, *([] if duration is None else [f"--duration={duration}"])]
+    limits = [("duration", duration), ("longest", longest)]
+    return [*quiet, *(f"--{name}={value}" for name, value in limits if value is not None)]
 
 
 def _out(options: argparse.Namespace) -> Path:

@@ -23,6 +23,7 @@ from onboard.agreement import Agreement
 from onboard.config import CONFIGS, Config
 from onboard.device_config import Kind
 from onboard.layers import ConfigError
+from sim_backend.faults import Faults
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
 from sim_backend.software_camera import SoftwareCamera
 from sim_backend.world import World
@@ -60,6 +61,50 @@ def world_of(config: Config) -> World:
 def mock_devices(world: World) -> DeviceSet:
     """All devices in process, on the world's own time."""
     return DeviceSet(MockAutopilot(world), MockOdometry(world), MockServos(world))
+
+
+class SimulatedDevices(DeviceSet):
+    """Devices in process that may be spoilt by faults, and hear of the mission's phase for that."""
+
+    def __init__(
+        self,
+        autopilot: AutopilotDevice,
+        odometry: OdometryDevice,
+        servos: ServoDevice,
+        world: World,
+        faults: list[Faults],
+    ) -> None:
+        super().__init__(autopilot, odometry, servos)
+        self._world, self._faults = world, faults
+
+    def enter(self, phase: str) -> None:
+        """The mission is in this phase. May be told in every tick."""
+        for faults in self._faults:
+            faults.enter(phase, self._world.time)
+
+
+def simulated_devices(world: World, config: Config) -> SimulatedDevices:
+    """All devices in process, failing as ``config.faults`` says. Raises ConfigError for a fault that none can show."""
+    if not config.faults:
+        return SimulatedDevices(MockAutopilot(world), MockOdometry(world), MockServos(world), world, [])
+    from sim_backend.faulty_devices import FaultyAutopilot, FaultyOdometry, FaultyServos
+
+    names = ("autopilot", "odometry", "servos")
+    errors = [
+        f"faults: no device {fault.device!r}; there are: {', '.join(names)}"
+        for fault in config.faults
+        if fault.device not in names
+    ]
+    if errors:
+        raise ConfigError(errors)
+    tracker, seed = config.devices.odometry, config.seed
+    try:
+        autopilot = FaultyAutopilot(world, config.faults, seed)
+        odometry = FaultyOdometry(world, config.faults, tracker.mount, tracker.jump, tracker.silence, seed)
+        servos = FaultyServos(world, config.faults, config.devices.servos, seed)
+    except ValueError as error:
+        raise ConfigError([f"faults: {error}"]) from error
+    return SimulatedDevices(autopilot, odometry, servos, world, [autopilot.faults, odometry.faults, servos.faults])
 
 
 def parameter_file(settings: Px4Settings) -> Path:
