@@ -17,7 +17,9 @@ from typing import Annotated, Any, Final
 import msgspec
 from msgspec import Meta, Struct
 
+from groundstation.parsing import nearest
 from onboard.headless import ConfigError, InfeasibleError, Mission, find, inline_text, read_struct
+from onboard.messages import Phase
 
 #: Where those lie that are shipped.
 SHIPPED: Final = Path(__file__).resolve().parent.parent / "configs" / "campaigns"
@@ -77,11 +79,14 @@ class Varied(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("the logarithm wants low above 0")
 
     def at(self, share: float) -> Any:
-        """The value below which this share (0..1) of the distribution lies."""
-        from scipy import stats
-
+        """The value below which this share (0..1) of the distribution lies, to six digits."""
         if self.values:
             return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
+        return float(f"{self._quantile(share):.6g}")
+
+    def _quantile(self, share: float) -> float:
+        from scipy import stats
+
         if self.spread is Spread.NORMAL:
             mean, sigma = float(self.mean or 0.0), float(self.sigma or 1.0)
             low = -3.0 if self.low is None else (self.low - mean) / sigma
@@ -99,23 +104,30 @@ class Varied(Struct, frozen=True, forbid_unknown_fields=True):
         return tuple(self.at(k / (self.steps - 1)) for k in range(self.steps))
 
 
+class Moment(Struct, frozen=True, forbid_unknown_fields=True):
+    """When a fault begins: a column of the matrix."""
+
+    name: Annotated[str, _note("name of the column")]
+    phase: Annotated[str, _note("phase of the mission")]
+    at: Annotated[float, Meta(ge=0.0, le=1e5), _note("after the phase was entered", "s")] = 0.5
+
+
 class FaultCase(Struct, frozen=True, forbid_unknown_fields=True):
-    """A fault that is flown in each of some phases, and how that may end."""
+    """A fault that is flown at each of some moments, and how that may end."""
 
     label: Annotated[str, _note("name of the row in the matrix")]
     device: Annotated[str, _note("autopilot, odometry or servos")]
     kind: Annotated[str, _note("kind of the fault")]
-    phases: Annotated[tuple[str, ...], _note("each of them in runs of its own; empty: those of the campaign")] = ()
-    start: Annotated[float, _note("after the phase was entered", "s")] = 0.5
+    moments: Annotated[tuple[str, ...], _note("names of those in which it is flown; empty: all")] = ()
     duration: Annotated[float, _note("how long; none: for good", "s")] | None = None
     value: Annotated[float, _note("how much")] = 0.0
     part: Annotated[str, _note("servo or message that it strikes")] = ""
     count: Annotated[int, _note("samples or packets that it strikes")] | None = None
-    ends: Annotated[tuple[str, ...], _note("how it may end: names of groundstation/campaign_ends.py")] = ()
+    ends: Annotated[tuple[str, ...], _note("how it may end; empty: in any way that harms nothing")] = ()
 
-    def fault(self, phase: str) -> dict[str, Any]:
-        """The fault in this phase, as the configuration has it."""
-        told: dict[str, Any] = {"device": self.device, "kind": self.kind, "phase": phase, "start": self.start}
+    def fault(self, moment: Moment) -> dict[str, Any]:
+        """The fault at this moment, as the configuration has it."""
+        told: dict[str, Any] = {"device": self.device, "kind": self.kind, "phase": moment.phase, "start": moment.at}
         told |= {"value": self.value} if self.value else {}
         told |= {name: value for name in ("duration", "count") if (value := getattr(self, name)) is not None}
         return told | ({"part": self.part} if self.part else {})
@@ -134,7 +146,8 @@ class Campaign(Struct, frozen=True, forbid_unknown_fields=True):
     design_seed: Annotated[int, Meta(ge=0, le=2**31), _note("seed of the design itself")] = 0
     parameters: tuple[Varied, ...] = ()
     faults: tuple[FaultCase, ...] = ()
-    phases: Annotated[tuple[str, ...], _note("phases of the faults that name none")] = ()
+    moments: tuple[Moment, ...] = ()
+    """When faults begin."""
     longest: Annotated[float, Meta(gt=0.0, le=1e5), _note("simulated time, then a run is broken off", "s")] = 900.0
     wall_s: Annotated[float, Meta(gt=0.0), _note("wall clock, then a run is given up", "s")] | None = None
     metric: Annotated[str, _note("figure by which the worst runs are chosen")] = "meas_des"
@@ -163,7 +176,7 @@ class Job(Struct, frozen=True):
     values: dict[str, bool | int | float | str] = {}
     """Of the varied parameters."""
     fault: str = ""
-    phase: str = ""
+    moment: str = ""
     ends: tuple[str, ...] = ()
 
     def command(self) -> str:
@@ -183,11 +196,15 @@ class Plan:
         self.name, self.campaign = name, campaign
 
     @property
-    def cells(self) -> list[tuple[FaultCase, str] | None]:
-        """Each fault with each of its phases; a single None where there are no faults."""
+    def cells(self) -> list[tuple[FaultCase, Moment] | None]:
+        """Each fault at each of its moments; a single None where there are no faults."""
         campaign = self.campaign
-        cells = [(case, phase) for case in campaign.faults for phase in case.phases or campaign.phases]
-        return list(cells) or [None]
+        return [
+            (case, moment)
+            for case in campaign.faults
+            for moment in campaign.moments
+            if moment.name in case.moments or not case.moments
+        ] or [None]
 
     @property
     def points(self) -> int:
@@ -234,12 +251,12 @@ class Plan:
             for shares in cube.random(self.campaign.runs):
                 yield {varied.name: varied.at(float(share)) for varied, share in zip(parameters, shares, strict=True)}
 
-    def _job(self, run: int, values: dict[str, Any], cell: tuple[FaultCase, str] | None, seed: int) -> Job:
+    def _job(self, run: int, values: dict[str, Any], cell: tuple[FaultCase, Moment] | None, seed: int) -> Job:
         campaign = self.campaign
         sets = [*campaign.set, *(f"{name}={inline_text(value)}" for name, value in values.items())]
-        case, phase = cell if cell is not None else (None, "")
-        if case is not None:
-            sets.append(f"faults={inline_text([case.fault(phase)])}")
+        case, moment = cell if cell is not None else (None, None)
+        if case is not None and moment is not None:
+            sets.append(f"faults={inline_text([case.fault(moment)])}")
         return Job(
             run,
             campaign.scenario,
@@ -250,7 +267,7 @@ class Plan:
             campaign.wall_s,
             values,
             case.label if case else "",
-            phase,
+            moment.name if moment else "",
             case.ends if case else (),
         )
 
@@ -279,16 +296,12 @@ def _path(given: str) -> Path:
         return Path(given)
     path = SHIPPED / f"{given}.yaml"
     if not path.is_file():
-        from groundstation.parsing import nearest
-
         known = nearest(given, shipped()) or shipped()
         raise ConfigError([f"{given}: no campaign of that name; there are: {', '.join(known)}; or give a file"])
     return path
 
 
 def _wrong_names(campaign: Campaign, figures: Sequence[str], ends: Sequence[str], path: Path) -> list[str]:
-    from groundstation.parsing import nearest
-
     def unknown(where: str, name: str, known: Sequence[str]) -> list[str]:
         if name in known:
             return []
@@ -296,18 +309,19 @@ def _wrong_names(campaign: Campaign, figures: Sequence[str], ends: Sequence[str]
         hint = f"nearest: {', '.join(best)}" if best else f"there are: {', '.join(known)}"
         return [f"{path}: {where} = {name!r}: no such name; {hint}"]
 
+    columns = [moment.name for moment in campaign.moments]
     errors = unknown("metric", campaign.metric, figures)
     for k, limit in enumerate(campaign.limits):
         errors += unknown(f"limits.{k}.metric", limit.metric, figures)
     for k, case in enumerate(campaign.faults):
-        if not case.phases and not campaign.phases:
-            errors.append(f"{path}: faults.{k}.phases: missing; name phases here or under phases of the campaign")
         for end in case.ends:
             errors += unknown(f"faults.{k}.ends", end, ends)
-        for name in case.phases:
-            errors += unknown(f"faults.{k}.phases", name, _phases())
-    for name in campaign.phases:
-        errors += unknown("phases", name, _phases())
+        for name in case.moments:
+            errors += unknown(f"faults.{k}.moments", name, columns)
+    for k, moment in enumerate(campaign.moments):
+        errors += unknown(f"moments.{k}.phase", moment.phase, [phase.value for phase in Phase])
+    if campaign.faults and not columns:
+        errors.append(f"{path}: moments: missing; say when the faults begin: moments: [{{name: press, phase: press}}]")
     if campaign.design is Design.GRID and campaign.runs != 1:
         errors.append(f"{path}: runs = {campaign.runs}: a grid has as many as it has points; leave it out")
     names = [varied.name for varied in campaign.parameters]
@@ -315,12 +329,6 @@ def _wrong_names(campaign: Campaign, figures: Sequence[str], ends: Sequence[str]
         f"{path}: parameters: {name} is given twice" for name in sorted({n for n in names if names.count(n) > 1})
     ]
     return errors
-
-
-def _phases() -> list[str]:
-    from onboard.messages import Phase
-
-    return [phase.value for phase in Phase]
 
 
 def _wrong_points(plan: Plan, path: Path) -> list[str]:
@@ -344,8 +352,8 @@ def _wrong_points(plan: Plan, path: Path) -> list[str]:
             text = f"{varied.name}={inline_text(value)}"
             errors += _refusals(campaign, text, f"{path}: parameters: {varied.name}")
     for case in campaign.faults:
-        phase = (case.phases or campaign.phases)[0]
-        errors += _refusals(campaign, f"faults={inline_text([case.fault(phase)])}", f"{path}: faults: {case.label}")
+        text = f"faults={inline_text([case.fault(campaign.moments[0])])}"
+        errors += _refusals(campaign, text, f"{path}: faults: {case.label}")
     return errors
 
 

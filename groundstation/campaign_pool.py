@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any, Final, TypeVar
 
 from groundstation.campaign_file import Job
@@ -46,15 +47,14 @@ class Pool:
             under_way[future.key] = job
             return future
 
-        done = as_completed([submit(job) for job, _ in zip(waiting, range(ahead), strict=False)])
+        done = as_completed([submit(job) for job in islice(waiting, ahead)], loop=self._client.loop)
         for future in done:
             job = under_way.pop(future.key)
             error = future.exception()
             yield future.result() if error is None else lost(job, f"{type(error).__name__}: {error}")
             future.release()
-            for job in waiting:
-                done.add(submit(job))
-                break
+            for following in islice(waiting, 1):
+                done.add(submit(following))
 
 
 @contextmanager

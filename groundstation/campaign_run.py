@@ -76,7 +76,7 @@ def flown(job: Job) -> dict[str, Any]:
         "run": job.run,
         "seed": job.seed,
         "fault": job.fault,
-        "phase": job.phase,
+        "moment": job.moment,
         "host": platform.node(),
         "command": job.command(),
         "values": msgspec.to_builtins(job.values),
@@ -112,7 +112,7 @@ def failed(job: Job, why: str) -> dict[str, Any]:
     """The row of a run whose process was lost."""
     blank = dict.fromkeys(NAMES)
     return {
-        "run": job.run, "seed": job.seed, "fault": job.fault, "phase": job.phase, "host": "", "command": job.command(),
+        "run": job.run, "seed": job.seed, "fault": job.fault, "moment": job.moment, "host": "", "command": job.command(),
         "values": msgspec.to_builtins(job.values), **blank, "end": "error", "outcome": "", "ended_in": "", "crash": "",
         "error": why, "version": "", "ok": False,
     }  # fmt: skip

@@ -22,7 +22,7 @@ from groundstation.campaign_file import Plan
 from groundstation.campaign_run import NAMES
 
 _ABOUT, _PARTS, _WHOLE, _LOCK = "campaign.json", "parts", "results.parquet", ".lock"
-_TEXTS: Final = ("fault", "phase", "end", "outcome", "ended_in", "crash", "error", "command", "host", "version")
+_TEXTS: Final = ("fault", "moment", "end", "outcome", "ended_in", "crash", "error", "command", "host", "version")
 #: Rows that are read at once while they are put together.
 _BATCH: Final = 256
 

@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from groundstation import (
     calibrate,
+    campaign,
     completion,
     estop,
     events,
@@ -69,7 +70,11 @@ examples:
   pipewright onboard --config /etc/pipewright.yaml --mission --out /var/log/pipewright/today
 """
 #: Packages that a vehicle's computer does not need, and the extra that brings each.
-_EXTRAS = {"cryptography": "ground", "rich": "ground", "textual": "ground", "tqdm": "sim"}
+_EXTRAS = {
+    "cryptography": "ground", "dask": "campaign", "distributed": "campaign", "matplotlib": "ground",
+    "optuna": "campaign", "pyarrow": "campaign", "rich": "ground", "scipy": "campaign", "textual": "ground",
+    "tqdm": "sim",
+}  # fmt: skip
 _LOG_HELP = "log.mcap of a run, or its run folder"
 
 
@@ -163,7 +168,21 @@ def _parser() -> argparse.ArgumentParser:
     for command in (sim, desk, onboard):
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
-    for group in (status, watch, estop, preflight, lease, orders, events, params, logs, calibrate, keys, completion):
+    for group in (
+        status,
+        watch,
+        estop,
+        preflight,
+        lease,
+        orders,
+        events,
+        params,
+        logs,
+        calibrate,
+        campaign,
+        keys,
+        completion,
+    ):
         group.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")

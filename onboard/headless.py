@@ -58,7 +58,10 @@ class Mission:
     def __init__(self, scenario: str, law: str | None, sets: tuple[str, ...], seed: int) -> None:
         self.config: Config = load_config(scenario, law, sets, seed)
         check_mission(self.config)
-        simulated_devices(world_of(self.config), self.config)
+        try:
+            simulated_devices(world_of(self.config), self.config)
+        except ValueError as error:  # parameters of the world that do not go together
+            raise ConfigError([f"world: {error}"]) from error
 
     @property
     def info(self) -> RunInfo:
