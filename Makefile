@@ -62,9 +62,9 @@ $(PY):
 	"$(PYTHON)" -m venv $(VENV)
 
 $(RUN): pyproject.toml constraints.txt | $(PY)
-	$(INSTALL) -e '.[sim,ground,vision]'
+	$(INSTALL) -e '.[sim,ground,campaign,vision]'
 	@touch $@
 
 $(DEV): $(RUN)
-	$(INSTALL) -e '.[sim,ground,vision,dev]'
+	$(INSTALL) -e '.[sim,ground,campaign,vision,dev]'
 	@touch $@

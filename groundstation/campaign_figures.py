@@ -1,4 +1,4 @@
-"""The pictures of a campaign as files: how its figures are distributed, and how every fault ends in every moment."""
+"""The pictures of a campaign as files: how its figures are distributed, and how every fault ends at every moment."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _DPI: Final = 110
 
 
 def matrix(summary: Summary, path: Path) -> None:
-    """Faults by moments of the mission: letter and colour of how the cell ended, a red frame where it may not end so."""
+    """Faults by moments: letter and colour of how the cell ended, a red frame where it may not end so."""
     faults = list(dict.fromkeys(cell.fault for cell in summary.cells))
     moments = list(dict.fromkeys(cell.moment for cell in summary.cells))
     order = list(ENDS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
 from typing import Any, Final, TypeVar
@@ -31,7 +31,9 @@ class Pool:
         """How many there are now."""
         return len(self._client.scheduler_info(n_workers=-1)["workers"])
 
-    def each(self, function: Callable[[Job], R], jobs: Iterable[Job], lost: Callable[[Job, str], R]) -> Iterator[R]:
+    def each(
+        self, function: Callable[[Job], R], jobs: Iterable[Job], lost: Callable[[Job, str], R]
+    ) -> Generator[R, None, None]:
         """What ``function`` makes of each job, as it is done; ``lost`` makes it of a job whose process has died.
 
         Only a few jobs are under way, and nothing is kept of those that are done.
@@ -39,22 +41,25 @@ class Pool:
         from distributed import as_completed
 
         waiting = iter(jobs)
-        under_way: dict[str, Job] = {}
+        under_way: dict[str, tuple[Any, Job]] = {}
         ahead = max(1, _AHEAD * self.workers)
 
         def submit(job: Job) -> Any:
             future = self._client.submit(function, job, pure=False, retries=0)
-            under_way[future.key] = job
+            under_way[future.key] = (future, job)
             return future
 
         done = as_completed([submit(job) for job in islice(waiting, ahead)], loop=self._client.loop)
-        for future in done:
-            job = under_way.pop(future.key)
-            error = future.exception()
-            yield future.result() if error is None else lost(job, f"{type(error).__name__}: {error}")
-            future.release()
-            for following in islice(waiting, 1):
-                done.add(submit(following))
+        try:
+            for future in done:
+                _, job = under_way.pop(future.key)
+                error = future.exception()
+                yield future.result() if error is None else lost(job, f"{type(error).__name__}: {error}")
+                future.release()
+                for following in islice(waiting, 1):
+                    done.add(submit(following))
+        finally:
+            self._client.cancel([future for future, _ in under_way.values()])
 
 
 @contextmanager

@@ -72,22 +72,7 @@ SAFE: Final = ("completed", "resumed", "landed", "autolanded", "grounded", "hold
 
 def flown(job: Job) -> dict[str, Any]:
     """Fly it, and tell it as a row; what goes wrong with it is told in the row as well."""
-    row: dict[str, Any] = {
-        "run": job.run,
-        "seed": job.seed,
-        "fault": job.fault,
-        "moment": job.moment,
-        "host": platform.node(),
-        "command": job.command(),
-        "values": msgspec.to_builtins(job.values),
-        **dict.fromkeys(NAMES),
-        "end": "error",
-        "outcome": "",
-        "ended_in": "",
-        "crash": "",
-        "error": "",
-        "version": "",
-    }
+    row = _blank(job)
     begun = time.perf_counter()
     try:
         with _ALONE:
@@ -110,12 +95,23 @@ def flown(job: Job) -> dict[str, Any]:
 
 def failed(job: Job, why: str) -> dict[str, Any]:
     """The row of a run whose process was lost."""
-    blank = dict.fromkeys(NAMES)
+    return _blank(job) | {"error": why}
+
+
+def _blank(job: Job) -> dict[str, Any]:
     return {
-        "run": job.run, "seed": job.seed, "fault": job.fault, "moment": job.moment, "host": "", "command": job.command(),
-        "values": msgspec.to_builtins(job.values), **blank, "end": "error", "outcome": "", "ended_in": "", "crash": "",
-        "error": why, "version": "", "ok": False,
-    }  # fmt: skip
+        "run": job.run,
+        "seed": job.seed,
+        "fault": job.fault,
+        "moment": job.moment,
+        "command": job.command(),
+        "values": msgspec.to_builtins(job.values),
+        **dict.fromkeys(NAMES),
+        **dict.fromkeys(("outcome", "ended_in", "crash", "error", "version"), ""),
+        "end": "error",
+        "ok": False,
+        "host": platform.node(),
+    }
 
 
 def _flight(mission: Mission, job: Job) -> Run:

@@ -278,9 +278,17 @@ TRUTH_LASTS = 0.05
 class Source(Protocol):
     """What a run is told by, and what is known of it in the end."""
 
-    info: RunInfo
-    config_yaml: str
-    complete: bool
+    @property
+    def info(self) -> RunInfo:
+        """What the run was."""
+
+    @property
+    def config_yaml(self) -> str:
+        """All that was in force, as text."""
+
+    @property
+    def complete(self) -> bool:
+        """It was told to its end."""
 
 
 def read_run(path: Path, *, partial: bool = False) -> Run:
