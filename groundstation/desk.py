@@ -106,10 +106,17 @@ def start(
     """Start an onboard process in a process group of its own, attended through its standard input."""
     command = [sys.executable, "-P", *program, *arguments]
     child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, text=True, process_group=0)
-    # Where the machine grants it (root, RLIMIT_RTPRIO), so that what else runs there is not what is measured.
-    with suppress(OSError):
-        os.sched_setscheduler(child.pid, os.SCHED_FIFO, os.sched_param(_PRIORITY[arguments[0]]))
+    prefer(child.pid, _PRIORITY[arguments[0]])
     return child
+
+
+def prefer(pid: int, priority: int) -> None:
+    """Let a process that was just started, and all threads that it will have, run before all ordinary ones.
+
+    Where the machine grants it (root, RLIMIT_RTPRIO): what else runs there is not what is measured.
+    """
+    with suppress(OSError):
+        os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def end(child: subprocess.Popen[str]) -> None:
