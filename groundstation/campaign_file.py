@@ -346,22 +346,30 @@ def _wrong_points(plan: Plan, path: Path) -> list[str]:
             find(config, [varied.name for varied in campaign.parameters])
         except ConfigError as error:
             return [f"{path}: parameters: {text}" for text in error.errors]
-    for varied in campaign.parameters:
-        ends = varied.values or (varied.at(0.0), varied.at(1.0))
-        for value in ends:
-            text = f"{varied.name}={inline_text(value)}"
-            errors += _refusals(campaign, text, f"{path}: parameters: {varied.name}")
-    for case in campaign.faults:
-        text = f"faults={inline_text([case.fault(campaign.moments[0])])}"
-        errors += _refusals(campaign, text, f"{path}: faults: {case.label}")
+    edges = [
+        varied.values[:1] + varied.values[-1:] or (varied.at(0.0), varied.at(1.0)) for varied in campaign.parameters
+    ]
+    texts = [
+        [f"{v.name}={inline_text(ends[k])}" for v, ends in zip(campaign.parameters, edges, strict=True)]
+        for k in (0, -1)
+    ]
+    faults = [case.fault(campaign.moments[0]) for case in campaign.faults]
+    # Most campaigns are right: all is tried at once, and one by one only where that is refused.
+    for together in texts:
+        if _refusals(campaign, together, ""):
+            for varied, text in zip(campaign.parameters, together, strict=True):
+                errors += _refusals(campaign, [text], f"{path}: parameters: {varied.name}")
+    if faults and _refusals(campaign, [f"faults={inline_text(faults)}"], ""):
+        for case, fault in zip(campaign.faults, faults, strict=True):
+            errors += _refusals(campaign, [f"faults={inline_text([fault])}"], f"{path}: faults: {case.label}")
     return errors
 
 
-def _refusals(campaign: Campaign, text: str, where: str) -> list[str]:
+def _refusals(campaign: Campaign, texts: Sequence[str], where: str) -> list[str]:
     try:
-        Mission(campaign.scenario, campaign.law, (*campaign.set, text), campaign.first_seed)
+        Mission(campaign.scenario, campaign.law, (*campaign.set, *texts), campaign.first_seed)
     except ConfigError as error:
         return [f"{where}: {words}" for words in error.errors]
     except InfeasibleError as error:
-        return [f"{where}: {text}: cannot be flown: {error}"]
+        return [f"{where}: {', '.join(texts)}: cannot be flown: {error}"]
     return []
