@@ -33,6 +33,7 @@ from sim_backend.world_messages import Camera, Look
 #: For the world to answer, s: it has told its address, so it moves.
 _WORLD_PATIENCE = 10.0
 _TELL_PERIOD = 0.1
+_NAMES = ("autopilot", "odometry", "servos")
 
 
 class DeviceSet:
@@ -85,26 +86,28 @@ class SimulatedDevices(DeviceSet):
 
 def simulated_devices(world: World, config: Config) -> SimulatedDevices:
     """All devices in process, failing as ``config.faults`` says. Raises ConfigError for a fault that none can show."""
-    if not config.faults:
-        return SimulatedDevices(MockAutopilot(world), MockOdometry(world), MockServos(world), world, [])
-    from sim_backend.faulty_devices import FaultyAutopilot, FaultyOdometry, FaultyServos
-
-    names = ("autopilot", "odometry", "servos")
-    errors = [
-        f"faults: no device {fault.device!r}; there are: {', '.join(names)}"
-        for fault in config.faults
-        if fault.device not in names
-    ]
+    faults, seed, tracker = config.faults, config.seed, config.devices.odometry
+    struck = {fault.device for fault in faults}
+    if struck:
+        from sim_backend.faulty_devices import FaultyAutopilot, FaultyOdometry, FaultyServos
+    errors = [f"faults: no device {name!r}; there are: {', '.join(_NAMES)}" for name in sorted(struck - set(_NAMES))]
     if errors:
         raise ConfigError(errors)
-    tracker, seed = config.devices.odometry, config.seed
+    autopilot, odometry, servos = MockAutopilot(world), MockOdometry(world), MockServos(world)
+    spoilt: list[Faults] = []
     try:
-        autopilot = FaultyAutopilot(world, config.faults, seed)
-        odometry = FaultyOdometry(world, config.faults, tracker.mount, tracker.jump, tracker.silence, seed)
-        servos = FaultyServos(world, config.faults, config.devices.servos, seed)
+        if "autopilot" in struck:
+            autopilot = failing = FaultyAutopilot(world, faults, seed)
+            spoilt.append(failing.faults)
+        if "odometry" in struck:
+            odometry = lost = FaultyOdometry(world, faults, tracker.mount, tracker.jump, tracker.silence, seed)
+            spoilt.append(lost.faults)
+        if "servos" in struck:
+            servos = limp = FaultyServos(world, faults, config.devices.servos, seed)
+            spoilt.append(limp.faults)
     except ValueError as error:
         raise ConfigError([f"faults: {error}"]) from error
-    return SimulatedDevices(autopilot, odometry, servos, world, [autopilot.faults, odometry.faults, servos.faults])
+    return SimulatedDevices(autopilot, odometry, servos, world, spoilt)
 
 
 def parameter_file(settings: Px4Settings) -> Path:
