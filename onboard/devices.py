@@ -93,18 +93,20 @@ def simulated_devices(world: World, config: Config) -> SimulatedDevices:
     errors = [f"faults: no device {name!r}; there are: {', '.join(_NAMES)}" for name in sorted(struck - set(_NAMES))]
     if errors:
         raise ConfigError(errors)
-    autopilot, odometry, servos = MockAutopilot(world), MockOdometry(world), MockServos(world)
+    autopilot: AutopilotDevice = MockAutopilot(world)
+    odometry: OdometryDevice = MockOdometry(world)
+    servos: ServoDevice = MockServos(world)
     spoilt: list[Faults] = []
     try:
         if "autopilot" in struck:
-            autopilot = failing = FaultyAutopilot(world, faults, seed)
-            spoilt.append(failing.faults)
+            autopilot = px4 = FaultyAutopilot(world, faults, seed)
+            spoilt.append(px4.faults)
         if "odometry" in struck:
-            odometry = lost = FaultyOdometry(world, faults, tracker.mount, tracker.jump, tracker.silence, seed)
-            spoilt.append(lost.faults)
+            odometry = camera = FaultyOdometry(world, faults, tracker.mount, tracker.jump, tracker.silence, seed)
+            spoilt.append(camera.faults)
         if "servos" in struck:
-            servos = limp = FaultyServos(world, faults, config.devices.servos, seed)
-            spoilt.append(limp.faults)
+            servos = bus = FaultyServos(world, faults, config.devices.servos, seed)
+            spoilt.append(bus.faults)
     except ValueError as error:
         raise ConfigError([f"faults: {error}"]) from error
     return SimulatedDevices(autopilot, odometry, servos, world, spoilt)

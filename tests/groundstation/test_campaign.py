@@ -15,12 +15,22 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import psutil
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from scipy.stats import binomtest
 
-from groundstation import campaign_figures, campaign_report, campaign_run, campaign_summary, cli, codes, metrics
+from groundstation import (
+    campaign_figures,
+    campaign_pool,
+    campaign_report,
+    campaign_run,
+    campaign_summary,
+    cli,
+    codes,
+    metrics,
+)
 from groundstation.campaign_file import (
     Campaign,
     Design,
@@ -409,6 +419,25 @@ def test_only_a_few_jobs_are_under_way_and_none_is_lost(threads: Pool) -> None:
     assert sorted(told) == sorted(k if k % 2 == 0 else -k for k in range(60))
 
 
+def test_the_same_command_on_a_cluster_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from distributed import LocalCluster
+
+    file = written(tmp_path, "seeds: 3\nlongest: 0.6\n")
+    command = ["campaign", file, "--out", str(tmp_path / "out"), "--no-progress", "--scheduler"]
+    monkeypatch.setattr(campaign_pool, "_PATIENCE", 0.5)
+    assert cli.main([*command, "tcp://127.0.0.1:9"]) == codes.NOT_THERE
+    assert "no Dask scheduler answers there" in capsys.readouterr().err
+    monkeypatch.undo()
+    with LocalCluster(
+        processes=False, n_workers=1, threads_per_worker=2, protocol="tcp", host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+    ) as cluster:  # fmt: skip
+        assert cli.main([*command, cluster.scheduler_address, "--resume"]) == codes.DONE
+    assert "3 of 3 runs: 3 unfinished" in capsys.readouterr().out
+
+
 _TINY = """
 scenario: paper
 runs: 6
@@ -425,6 +454,7 @@ def test_killed_and_resumed_no_run_is_lost_or_doubled(tmp_path: Path) -> None:
     parts = tmp_path / "out" / "parts"
     process = subprocess.Popen(command, cwd=tmp_path, start_new_session=True)
     seconds_until(lambda: len(list(parts.glob("*.parquet"))) >= 2)
+    assert _listening(process.pid) <= {"127.0.0.1"}
     process.send_signal(signal.SIGKILL)
     process.wait()
     before = {path.name: path.read_bytes() for path in parts.glob("*.parquet")}
@@ -439,6 +469,13 @@ def test_killed_and_resumed_no_run_is_lost_or_doubled(tmp_path: Path) -> None:
     kept = pq.read_table(pa.BufferReader(before["0000000.parquet"]))
     assert table["wall_s"][0] == kept["wall_s"][0], "what was there is not flown again"
     assert (tmp_path / "out" / "report.html").is_file()
+
+
+def _listening(pid: int) -> set[str]:
+    """Addresses at which the process and its children take connections."""
+    process = psutil.Process(pid)
+    sockets = [s for one in (process, *process.children(recursive=True)) for s in one.net_connections("inet")]
+    return {s.laddr.ip for s in sockets if s.status == psutil.CONN_LISTEN}
 
 
 def _alive(group: int) -> bool:
