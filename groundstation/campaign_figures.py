@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-import matplotlib
 import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from groundstation.campaign_run import ENDS, FIGURES
 from groundstation.campaign_summary import Summary, column
@@ -39,7 +39,7 @@ def matrix(summary: Summary, path: Path) -> None:
         x, y = moments.index(cell.moment), faults.index(cell.fault)
         worst = max(cell.ends, key=order.index)
         axes.add_patch(
-            matplotlib.patches.Rectangle(
+            Rectangle(
                 (x - 0.46, y - 0.44), 0.92, 0.88,
                 facecolor=COLOURS[worst], edgecolor="none" if cell.ok else "red", linewidth=2.0,
             )
@@ -67,7 +67,10 @@ def matrix(summary: Summary, path: Path) -> None:
 
 def distributions(summary: Summary, table: pa.Table, path: Path) -> None:
     """Histograms of the figures of force and contact, with median, 95th percentile and the limits asked for."""
-    known = [figure for figure in FIGURES if figure.name in _SHOWN and figure.name in summary.figures]
+    spreads = summary.figures
+    known = [
+        f for f in FIGURES if f.name in _SHOWN and f.name in spreads and spreads[f.name].low < spreads[f.name].high
+    ]
     if not known:
         return
     rows = -(-len(known) // 3)
@@ -103,4 +106,7 @@ def _histogram(axes: Axes, summary: Summary, table: pa.Table, name: str, label: 
             )
     axes.set_title(label, fontsize=8)
     axes.tick_params(labelsize=8)
+    axes.set_ylabel("runs", fontsize=8)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.legend(fontsize=7, frameon=False)

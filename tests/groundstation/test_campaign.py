@@ -340,7 +340,8 @@ def test_the_summary_counts_measures_and_finds_the_worst(tmp_path: Path) -> None
     assert summary.figures["meas_des"].median == pytest.approx(np.median(known))
     assert [verdict.met for verdict in summary.verdicts] == [True, False]
     (felt,) = [item for item in summary.sensitivities if item.figure == "meas_des"]
-    assert (felt.parameter, felt.strength) == ("repair.force", pytest.approx(1.0))
+    assert felt.parameter == "repair.force"
+    assert felt.strength == pytest.approx(1.0)
     assert [worst.run for worst in summary.worst[:2]] == [7, 9]
     assert summary.worst[0].why == "hit the ground"
     assert len(summary.worst) == 10

@@ -117,13 +117,11 @@ def test_a_cut_link_is_cut_both_ways(world: World, kind: Kind) -> None:
 
 def test_a_reboot_stops_the_motors_and_forgets(world: World) -> None:
     device = autopilot(world, kind=Kind.REBOOT, start=2.5, duration=0.5)
-    run(world, device, 2.5, follow(world, device))
-    assert world.autopilot.armed
-    run(world, device, 0.1, follow(world, device))
-    assert not world.autopilot.armed
-    assert world.autopilot.killed
-    run(world, device, 0.6)
-    assert not world.autopilot.killed
+    states = []
+    for seconds in (2.5, 0.1, 0.6):
+        run(world, device, seconds, follow(world, device))
+        states.append((world.autopilot.armed, world.autopilot.killed))
+    assert states == [(True, False), (False, True), (False, False)]
 
 
 @pytest.mark.parametrize("kind", [Kind.NAN, Kind.FREEZE])
