@@ -176,7 +176,8 @@ def _say(summary: Summary, folder: Path, console: Any) -> None:
     console.print(f"{summary.name}: {summary.runs} of {summary.planned} runs: {ends}")
     console.print(
         f"completed {100 * success.share:.1f} % ({100 * success.low:.1f} to {100 * success.high:.1f} %), "
-        f"lost {100 * lost.share:.1f} % (up to {100 * lost.high:.1f} %); {summary.speed:.1f} x real time per core"
+        f"lost {100 * lost.share:.1f} % (up to {100 * lost.high:.1f} %); {summary.speed:.1f} x real time per core",
+        soft_wrap=True,
     )
     for verdict in summary.verdicts:
         mark = "[green]✓[/]" if verdict.met else "[red]✗[/]"

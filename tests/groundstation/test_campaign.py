@@ -436,7 +436,7 @@ def test_the_same_command_on_a_cluster_elsewhere(
         dashboard_address="127.0.0.1:0",
     ) as cluster:  # fmt: skip
         assert cli.main([*command, cluster.scheduler_address, "--resume"]) == codes.DONE
-    assert "3 of 3 runs: 3 unfinished" in capsys.readouterr().out
+    assert "3 of 3 runs: 3 grounded" in capsys.readouterr().out
 
 
 _TINY = """
