@@ -22,12 +22,14 @@ const PIPE: Color = { r: 0.75, g: 0.55, b: 0.3, a: 0.6 };
 const CRACK: Color = { r: 0.8, g: 0.1, b: 0.1, a: 1 };
 const ARM: Color = { r: 0.95, g: 0.6, b: 0.1, a: 1 };
 const NEEDLE: Color = { r: 0.3, g: 0.75, b: 0.95, a: 1 };
-const ROTOR: Color = { r: 0.3, g: 0.55, b: 0.9, a: 0.35 };
-const NOSE: Color = { r: 0.9, g: 0.2, b: 0.2, a: 0.6 };
+const ROTOR: Color = { r: 0.3, g: 0.55, b: 0.9, a: 0.25 };
+const NOSE: Color = { r: 0.3, g: 0.9, b: 0.7, a: 0.25 }; // the two rotors ahead
 const FORCE: Color = { r: 0.95, g: 0.1, b: 0.5, a: 1 };
 const TRACK: Color = { r: 0.2, g: 0.8, b: 0.4, a: 1 };
 const SLEEVE: Color = { r: 0.9, g: 0.9, b: 0.3, a: 0.9 };
 const TEXT: Color = { r: 0.6, g: 0.65, b: 0.7, a: 1 };
+
+const UNCHANGED: SceneUpdate = { deletions: [], entities: [] }; // a script that returns nothing is warned of
 
 let set: Input<"/params">["message"] | undefined;
 let drawn = -Infinity;
@@ -77,18 +79,18 @@ function arrow(from: Vector, along: Vector): ArrowPrimitive {
   const unit: Vector = [along[0] / length, along[1] / length, along[2] / length];
   return {
     pose: { position: point(from), orientation: turn([1, 0, 0], unit) },
-    shaft_length: 0.75 * length, shaft_diameter: 0.015, head_length: 0.25 * length, head_diameter: 0.035, color: FORCE,
+    shaft_length: 0.75 * length, shaft_diameter: 0.02, head_length: 0.25 * length, head_diameter: 0.05, color: FORCE,
   };
 }
 
-export default function script(event: Input<"/params"> | Input<"/tick">): SceneUpdate | undefined {
+export default function script(event: Input<"/params"> | Input<"/tick">): SceneUpdate {
   if (event.topic === "/params") {
     set = event.message;
-    return undefined;
+    return UNCHANGED;
   }
   const now = event.receiveTime.sec + 1e-9 * event.receiveTime.nsec;
   if (set == undefined || (now > drawn && now < drawn + PERIOD)) {
-    return undefined;
+    return UNCHANGED;
   }
   drawn = now;
   const tick = event.message;
