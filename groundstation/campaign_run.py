@@ -47,6 +47,8 @@ FIGURES: Final = (
     Figure("thrust_max", "N", "largest thrust of a rotor"),
     Figure("torque_max", "N m", "largest torque of a joint"),
     Figure("path_error_rms", "m", "needle off its path, RMS"),
+    Figure("estimator_gain", "", "the paper's estimator's RMSE by that of the selected one"),
+    Figure("false_contacts", "", "contacts that the trigger saw and were none"),
     Figure("sim_s", "s", "simulated time"),
     Figure("wall_s", "s", "time it took"),
     Figure("speed", "", "times real time"),
@@ -128,7 +130,7 @@ def _flight(mission: Mission, job: Job) -> Run:
 
 
 def _told(run: Run, figures: dict[str, Any]) -> dict[str, Any]:
-    contact, limits = figures["contact"], figures["limits"]
+    contact, limits, estimators = figures["contact"], figures["limits"], figures.get("estimators") or {}
     pressing = run.where(Phase.PRESS)
     force = run.truth.force if run.truth is not None else run.force_est
     return {
@@ -145,6 +147,8 @@ def _told(run: Run, figures: dict[str, Any]) -> dict[str, Any]:
         "thrust_max": limits["thrust_max"],
         "torque_max": limits["torque_max"],
         "path_error_rms": figures["adhesive"]["path_error_rms"],
+        "estimator_gain": estimators.get("ratio"),
+        "false_contacts": estimators.get("false_contacts"),
         "sim_s": figures["sim_s"],
     }
 

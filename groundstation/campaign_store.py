@@ -36,6 +36,7 @@ class About(Struct, frozen=True):
 
     name: str
     digest: str
+    columns: list[str]
     runs: int
     campaign: Any = None
 
@@ -57,7 +58,8 @@ class Store:
 
     def begin(self, resume: bool) -> None:
         """Make the folder, or go on in it. Raises StoreError when it is another campaign's, or has runs already."""
-        about = About(self._plan.name, self._plan.digest(), len(self._plan), msgspec.to_builtins(self._plan.campaign))
+        plan, columns = self._plan, self.schema.names
+        about = About(plan.name, plan.digest(), columns, len(plan), msgspec.to_builtins(plan.campaign))
         there = self.folder / _ABOUT
         if there.is_file():
             former = msgspec.json.decode(there.read_bytes(), type=About)
@@ -70,6 +72,8 @@ class Store:
                     f"{self.folder}: holds {former.name} as its file was then; it has been changed since, so its runs "
                     "are others: give another --out"
                 )
+            if former.columns != columns:
+                raise StoreError(f"{self.folder}: was begun by a version that told other figures: give another --out")
         elif self.folder.is_dir() and any(self.folder.iterdir()):
             raise StoreError(f"{self.folder}: holds other files; give a new or empty folder")
         self._parts.mkdir(parents=True, exist_ok=True)
