@@ -66,8 +66,7 @@ def run(options: argparse.Namespace) -> int:
         workers = pool_size(options)
         plan = read_campaign(options.file, NAMES, tuple(ENDS))
         store = Store(_folder(options, plan.name), plan)
-        store.begin(options.resume)
-        with store.alone():
+        with store.opened(resume=options.resume):
             interrupted = _fly(plan, store, workers, options)
             summary = _report(plan, store)
     except (ConfigError, StoreError) as error:

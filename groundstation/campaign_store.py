@@ -56,40 +56,46 @@ class Store:
             + varied
         )
 
-    def begin(self, resume: bool) -> None:
-        """Make the folder, or go on in it. Raises StoreError when it is another campaign's, or has runs already."""
-        plan, columns = self._plan, self.schema.names
-        about = About(plan.name, plan.digest(), columns, len(plan), msgspec.to_builtins(plan.campaign))
-        there = self.folder / _ABOUT
-        if there.is_file():
-            former = msgspec.json.decode(there.read_bytes(), type=About)
-            if not resume:
-                raise StoreError(
-                    f"{self.folder}: holds {former.name} already; --resume goes on with it, or give another --out"
-                )
-            if former.digest != about.digest:
-                raise StoreError(
-                    f"{self.folder}: holds {former.name} as its file was then; it has been changed since, so its runs "
-                    "are others: give another --out"
-                )
-            if former.columns != columns:
-                raise StoreError(f"{self.folder}: was begun by a version that told other figures: give another --out")
-        elif self.folder.is_dir() and any(self.folder.iterdir()):
-            raise StoreError(f"{self.folder}: holds other files; give a new or empty folder")
-        self._parts.mkdir(parents=True, exist_ok=True)
-        _write(there, msgspec.json.format(msgspec.json.encode(about)))
-        for left in self._parts.glob("*.tmp"):
-            left.unlink()
-
     @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Nobody else adds runs meanwhile. Raises StoreError when somebody does."""
+    def opened(self, *, resume: bool) -> Iterator[None]:
+        """Make the folder, or go on in it; nobody else adds runs meanwhile.
+
+        Raises StoreError when it is another campaign's, has runs already, or somebody else is at work on it.
+        """
+        self._check(resume)
+        self._parts.mkdir(parents=True, exist_ok=True)
         with (self.folder / _LOCK).open("w") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise StoreError(f"{self.folder}: another process is at work on it; wait for it or end it") from None
+            for left in self._parts.glob("*.tmp"):
+                left.unlink()
+            _write(self.folder / _ABOUT, msgspec.json.format(msgspec.json.encode(self._about)))
             yield
+
+    def _check(self, resume: bool) -> None:
+        there, about = self.folder / _ABOUT, self._about
+        if not there.is_file():
+            if self.folder.is_dir() and any(path.name not in (_LOCK, _PARTS) for path in self.folder.iterdir()):
+                raise StoreError(f"{self.folder}: holds other files; give a new or empty folder")
+            return
+        former = msgspec.json.decode(there.read_bytes(), type=About)
+        if not resume:
+            words = "--resume goes on with it, or give another --out"
+            raise StoreError(f"{self.folder}: holds {former.name} already; {words}")
+        if former.digest != about.digest:
+            raise StoreError(
+                f"{self.folder}: holds {former.name} as its file was then; it has been changed since, so its runs "
+                "are others: give another --out"
+            )
+        if former.columns != about.columns:
+            raise StoreError(f"{self.folder}: was begun by a version that told other figures: give another --out")
+
+    @property
+    def _about(self) -> About:
+        plan = self._plan
+        return About(plan.name, plan.digest(), self.schema.names, len(plan), msgspec.to_builtins(plan.campaign))
 
     def done(self) -> set[int]:
         """Numbers of the runs that are there."""
@@ -107,17 +113,11 @@ class Store:
 
     def compact(self) -> None:
         """Put all rows into one file, in the order of the runs."""
-        whole = self.folder / _WHOLE
-        parts = sorted(self._parts.glob("*.parquet"))
+        parts = self._part_files()
         if parts:
-            tables = [self._read(parts[k : k + _BATCH]) for k in range(0, len(parts), _BATCH)]
-            if whole.is_file():
-                former = pq.read_table(whole, schema=self.schema)
-                new = pa.concat_tables(tables)
-                fresh = ~_isin(former["run"], new["run"])
-                tables = [former.filter(pa.array(fresh)), new]
+            whole = self.folder / _WHOLE
             temporary = whole.with_suffix(".tmp")
-            pq.write_table(pa.concat_tables(tables).sort_by("run"), temporary)
+            pq.write_table(self.table(), temporary)
             with temporary.open("rb") as file:
                 os.fsync(file.fileno())
             temporary.replace(whole)
@@ -128,21 +128,20 @@ class Store:
             self._parts.rmdir()
 
     def table(self) -> pa.Table:
-        """All rows that are there, in the order of the runs."""
-        whole = self.folder / _WHOLE
-        tables = [pq.read_table(whole, schema=self.schema)] if whole.is_file() else []
-        parts = sorted(self._parts.glob("*.parquet"))
-        tables += [self._read(parts)] if parts else []
+        """All rows that are there, in the order of the runs, each once."""
+        whole, parts = self.folder / _WHOLE, self._part_files()
+        tables = [self._read(parts[k : k + _BATCH]) for k in range(0, len(parts), _BATCH)]
+        if whole.is_file():
+            here = {int(path.stem) for path in parts}
+            former = pq.read_table(whole, schema=self.schema)
+            tables.append(former.filter(pa.array([run not in here for run in former["run"].to_pylist()], pa.bool_())))
         return pa.concat_tables(tables).sort_by("run") if tables else self.schema.empty_table()
+
+    def _part_files(self) -> list[Path]:
+        return sorted(self._parts.glob("*.parquet"))
 
     def _read(self, parts: Sequence[Path]) -> pa.Table:
         return pa.concat_tables([pq.read_table(part, schema=self.schema) for part in parts])
-
-
-def _isin(values: pa.ChunkedArray, among: pa.ChunkedArray) -> Any:
-    import numpy as np
-
-    return np.isin(values.to_numpy(), among.to_numpy())
 
 
 def _kind(values: Iterable[Any]) -> pa.DataType:

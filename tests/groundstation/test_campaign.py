@@ -281,22 +281,23 @@ def test_rows_are_there_once_whatever_was_killed_when(tmp_path: Path, monkeypatc
     plan = plan_of(6)
     rows = rows_of(plan)
     store = Store(tmp_path / "here", plan)
-    store.begin(resume=False)
-    for row in rows[:3]:
-        store.put(row)
-    (tmp_path / "here" / "parts" / "0000003.tmp").write_bytes(b"half a row")
+    with store.opened(resume=False):
+        for row in rows[:3]:
+            store.put(row)
+        (tmp_path / "here" / "parts" / "0000003.tmp").write_bytes(b"half a row")
     store = Store(tmp_path / "here", plan)
-    store.begin(resume=True)
-    assert store.done() == {0, 1, 2}
-    assert not list((tmp_path / "here" / "parts").glob("*.tmp"))
-    with monkeypatch.context() as killed:  # between the whole file and the end of its parts
-        killed.setattr(Path, "unlink", lambda self, **_: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            store.compact()
-    assert store.done() == {0, 1, 2}
-    for row in reversed(rows[3:]):
-        store.put(row)
-    store.compact()
+    with store.opened(resume=True):
+        assert store.done() == {0, 1, 2}
+        assert not list((tmp_path / "here" / "parts").glob("*.tmp"))
+        with monkeypatch.context() as killed:  # between the whole file and the end of its parts
+            killed.setattr(Path, "unlink", lambda self, **_: (_ for _ in ()).throw(KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                store.compact()
+        assert store.done() == {0, 1, 2}
+        assert store.table()["run"].to_pylist() == [0, 1, 2]
+        for row in reversed(rows[3:]):
+            store.put(row)
+        store.compact()
     table = store.table()
     assert table["run"].to_pylist() == list(range(6))
     assert table["meas_des"].to_pylist() == [row["meas_des"] for row in rows]
@@ -304,20 +305,26 @@ def test_rows_are_there_once_whatever_was_killed_when(tmp_path: Path, monkeypatc
     assert not (tmp_path / "here" / "parts").exists()
 
 
+def opened(store: Store, *, resume: bool) -> None:
+    with store.opened(resume=resume):
+        pass
+
+
 def test_a_folder_is_of_one_campaign_and_of_one_process(tmp_path: Path) -> None:
     store = Store(tmp_path, plan_of(3))
-    store.begin(resume=False)
+    opened(store, resume=False)
     with pytest.raises(StoreError, match="--resume goes on with it"):
-        store.begin(resume=False)
+        opened(store, resume=False)
     with pytest.raises(StoreError, match="it has been changed since"):
-        Store(tmp_path, plan_of(4)).begin(resume=True)
-    with store.alone(), pytest.raises(StoreError, match="another process is at work"), store.alone():
-        pass
+        opened(Store(tmp_path, plan_of(4)), resume=True)
+    with store.opened(resume=True), pytest.raises(StoreError, match="another process is at work"):
+        opened(Store(tmp_path, plan_of(3)), resume=True)
     other = tmp_path / "other"
     other.mkdir()
     (other / "letter").write_text("")
     with pytest.raises(StoreError, match="holds other files"):
-        Store(other, plan_of(3)).begin(resume=True)
+        opened(Store(other, plan_of(3)), resume=True)
+    assert [path.name for path in other.iterdir()] == ["letter"]
 
 
 # --- all together -----------------------------------------------------------------------------------------------------
@@ -329,7 +336,7 @@ def test_the_summary_counts_measures_and_finds_the_worst(tmp_path: Path) -> None
     rows[7] |= {"end": "lost", "ok": False, "crash": "hit the ground", "meas_des": None}
     rows[9] |= {"end": "landed"}
     store = Store(tmp_path, plan)
-    store.begin(resume=False)
+    opened(store, resume=False)
     for row in rows:
         store.put(row)
     summary = campaign_summary.summarize(plan, store.table())
@@ -371,7 +378,7 @@ def test_the_matrix_shows_which_cell_ended_wrong(tmp_path: Path) -> None:
     )
     plan = Plan("cells", campaign)
     store = Store(tmp_path, plan)
-    store.begin(resume=False)
+    opened(store, resume=False)
     for job, end in zip(plan.jobs(), ("landed", "completed", "resumed", "lost"), strict=True):
         ok = end in (job.ends or campaign_run.SAFE)
         store.put(campaign_run.failed(job, "") | {"end": end, "ok": ok})
