@@ -448,34 +448,49 @@ def test_the_same_command_on_a_cluster_elsewhere(
 
 _TINY = """
 scenario: paper
-runs: 6
+runs: 7
 longest: 4.0
 set: [plan.takeoff_height=0.5]
 parameters: [{name: repair.force, low: 2.0, high: 3.0}]
 """
 
 
-def test_killed_and_resumed_no_run_is_lost_or_doubled(tmp_path: Path) -> None:
+def test_killed_interrupted_and_resumed_no_run_is_lost_or_doubled(tmp_path: Path) -> None:
     file = written(tmp_path, _TINY)
     command = [sys.executable, "-c", "import sys; from groundstation.cli import main; sys.exit(main())"]
     command += ["campaign", file, "--workers", "1", "--out", str(tmp_path / "out"), "--no-progress"]
     parts = tmp_path / "out" / "parts"
-    process = subprocess.Popen(command, cwd=tmp_path, start_new_session=True)
-    seconds_until(lambda: len(list(parts.glob("*.parquet"))) >= 2)
-    assert _listening(process.pid) <= {"127.0.0.1"}
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    before = {path.name: path.read_bytes() for path in parts.glob("*.parquet")}
-    assert 2 <= len(before) < 6
-    seconds_until(lambda: not _alive(process.pid))
+
+    def until(count: int, *more: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [*command, *more], cwd=tmp_path, start_new_session=True, stderr=subprocess.PIPE, text=True
+        )
+        seconds_until(lambda: len(list(parts.glob("*.parquet"))) >= count)
+        return process
+
+    killed = until(2)
+    assert _listening(killed.pid) <= {"127.0.0.1"}
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate()
+    kept = (parts / "0000000.parquet").read_bytes()
+    seconds_until(lambda: not _alive(killed.pid))
+
+    interrupted = until(4, "--resume")
+    os.killpg(interrupted.pid, signal.SIGINT)
+    _, told = interrupted.communicate()
+    assert interrupted.returncode == codes.INTERRUPTED, told
+    assert re.fullmatch(
+        r"pipewright: interrupted: [45] of 7 runs are in \S+; the same command with --resume .*\n", told
+    )
+
     ended = subprocess.run([*command, "--resume"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.returncode == codes.DONE, ended.stderr
-    assert "6 of 6 runs: 6 unfinished" in ended.stdout
+    assert "7 of 7 runs: 7 unfinished" in ended.stdout
     assert ended.stderr == ""
     table = Store(tmp_path / "out", read(file)).table()
-    assert table["run"].to_pylist() == list(range(6))
-    kept = pq.read_table(pa.BufferReader(before["0000000.parquet"]))
-    assert table["wall_s"][0] == kept["wall_s"][0], "what was there is not flown again"
+    assert table["run"].to_pylist() == list(range(7))
+    first = pq.read_table(pa.BufferReader(kept))
+    assert table["wall_s"][0] == first["wall_s"][0], "what was there is not flown again"
     assert (tmp_path / "out" / "report.html").is_file()
 
 
