@@ -27,6 +27,7 @@ from groundstation import (
     orders,
     params,
     preflight,
+    recompute,
     status,
     watch,
 )
@@ -160,7 +161,21 @@ def _parser() -> argparse.ArgumentParser:
     for command in (sim, desk, onboard):
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
-    for group in (status, watch, estop, preflight, lease, orders, events, params, logs, calibrate, keys, completion):
+    for group in (
+        status,
+        watch,
+        estop,
+        preflight,
+        lease,
+        orders,
+        events,
+        params,
+        logs,
+        recompute,
+        calibrate,
+        keys,
+        completion,
+    ):
         group.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")
