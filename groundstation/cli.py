@@ -28,6 +28,7 @@ from groundstation import (
     orders,
     params,
     preflight,
+    recompute,
     status,
     tune,
     watch,
@@ -169,7 +170,7 @@ def _parser() -> argparse.ArgumentParser:
     for command in (sim, desk, onboard):
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
-    of_vehicle = (status, watch, estop, preflight, lease, orders, events, params, logs)
+    of_vehicle = (status, watch, estop, preflight, lease, orders, events, params, logs, recompute)
     for group in (*of_vehicle, calibrate, campaign, tune, keys, completion):
         group.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
