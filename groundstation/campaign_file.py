@@ -192,8 +192,9 @@ class Job(Struct, frozen=True):
 class Plan:
     """A checked campaign, and its runs."""
 
-    def __init__(self, name: str, campaign: Campaign) -> None:
-        self.name, self.campaign = name, campaign
+    def __init__(self, name: str, campaign: Campaign, base: str = "") -> None:
+        """base: all parameters that are in force before any is varied, as text."""
+        self.name, self.campaign, self._base = name, campaign, base
 
     @property
     def cells(self) -> list[tuple[FaultCase, Moment] | None]:
@@ -222,7 +223,7 @@ class Plan:
 
     def digest(self) -> str:
         """Equal for equal runs."""
-        return hashlib.sha256(msgspec.json.encode(self.campaign)).hexdigest()
+        return hashlib.sha256(msgspec.json.encode(self.campaign) + self._base.encode()).hexdigest()
 
     def jobs(self) -> Iterator[Job]:
         """All runs, in order."""
@@ -283,7 +284,8 @@ def read_campaign(given: str, figures: Sequence[str], ends: Sequence[str]) -> Pl
     errors = _wrong_names(campaign, figures, ends, path) or _wrong_points(plan, path)
     if errors:
         raise ConfigError(errors)
-    return plan
+    base = Mission(campaign.scenario, campaign.law, campaign.set, campaign.first_seed).yaml
+    return Plan(path.stem, campaign, base)
 
 
 def shipped() -> list[str]:

@@ -163,6 +163,15 @@ def test_the_command_tells_wrong_input_and_makes_nothing(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_changed_scenario_makes_other_runs(tmp_path: Path) -> None:
+    scenario, file = tmp_path / "here.yaml", written(tmp_path, f"scenario: {tmp_path / 'here.yaml'}")
+    scenario.write_text("repair: {hold: 2.0}")
+    before = read_campaign(file, NAMES, tuple(ENDS)).digest()
+    assert read_campaign(file, NAMES, tuple(ENDS)).digest() == before
+    scenario.write_text("repair: {hold: 2.5}")
+    assert read_campaign(file, NAMES, tuple(ENDS)).digest() != before
+
+
 # --- the design -------------------------------------------------------------------------------------------------------
 
 
@@ -315,7 +324,7 @@ def test_a_folder_is_of_one_campaign_and_of_one_process(tmp_path: Path) -> None:
     opened(store, resume=False)
     with pytest.raises(StoreError, match="--resume goes on with it"):
         opened(store, resume=False)
-    with pytest.raises(StoreError, match="it has been changed since"):
+    with pytest.raises(StoreError, match="something has been changed since"):
         opened(Store(tmp_path, plan_of(4)), resume=True)
     with store.opened(resume=True), pytest.raises(StoreError, match="another process is at work"):
         opened(Store(tmp_path, plan_of(3)), resume=True)
