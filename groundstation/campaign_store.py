@@ -86,8 +86,8 @@ class Store:
             raise StoreError(f"{self.folder}: holds {former.name} already; {words}")
         if former.digest != about.digest:
             raise StoreError(
-                f"{self.folder}: holds {former.name} as its file and its scenario were then; something has been changed "
-                "since, so its runs are others: give another --out"
+                f"{self.folder}: holds {former.name} as its file and its scenario were then; something has been "
+                "changed since, so its runs are others: give another --out"
             )
         if former.columns != about.columns:
             raise StoreError(f"{self.folder}: was begun by a version that told other figures: give another --out")
