@@ -161,4 +161,3 @@ def _lump(vehicle: Vehicle, part: Part, out: dict[str, Body]) -> None:
         raise ValueError(f"vehicle.arm: part {part.name} is not fixed to the tool at the wrist")
     if a3 != 0.0 and carrier is not Carrier.TOOL:
         raise ValueError(f"vehicle.arm: part {part.name} moves with the tool but does not turn with it")
-

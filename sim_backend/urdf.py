@@ -1,4 +1,4 @@
-"""The vehicle as URDF, made from its one description: bodies of ``lumping``, what they touch with, and how they look."""
+"""The vehicle as URDF, made from its one description: the bodies of ``lumping``, what touches, and how they look."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from sim_backend.lumping import SHOULDER, SLEEVE, Inertial, bodies, inertial
 
 #: Radius of the balls that touch pipe or ground, m.
 TOUCH_RADIUS = 0.004
-#: Links that are only there to look at, with the joint angle (0 for theta_1, 1 for theta_2) that each follows.
-BARS = (("rod", 0), ("level_rod_1", 0), ("level_rod_2", 1))
+#: Links that are only there to look at; each one's joint turns by so much of theta_1 and theta_2.
+BARS = {"rod": (1.0, -1.0), "level_rod_1": (1.0, 0.0), "level_rod_2": (0.0, 1.0)}
+#: The link with the needle's tip.
+NEEDLE = "needle"
 
 _COLOURS = {
     "frame": (0.16, 0.18, 0.22),
@@ -25,6 +27,7 @@ _COLOURS = {
     "sleeve": (0.15, 0.65, 0.40),
 }
 _ORIGIN = (0.0, 0.0, 0.0)
+_WEIGHTLESS = Inertial(1e-9, _ORIGIN, 0.0, (1e-12, 1e-12, 1e-12))
 
 
 def urdf(vehicle: Vehicle, bars: bool = False) -> str:
@@ -69,10 +72,12 @@ def urdf(vehicle: Vehicle, bars: bool = False) -> str:
         elif name == "tool":
             _rod(link, _ORIGIN, (arm.gripper - 0.03, 0.0, 0.0), 0.013, "tool")
             _rod(link, _ORIGIN, (0.0, 0.0, arm.needle), 0.003, "rear")
-            _ball(link, (0.0, 0.0, arm.needle))
             # Two capsules (pipe and tip) have a closed-form distance; anything else is iterated.
             tip = (arm.gripper - TOUCH_RADIUS, 0.0, 0.0)
             _shape(link, "collision", tip, "capsule", radius=TOUCH_RADIUS, length=1e-4)
+    # A link of its own, since it touches what the gripper's tip does not, and the other way round.
+    _ball(_link(robot, NEEDLE, _WEIGHTLESS), (0.0, 0.0, arm.needle - TOUCH_RADIUS))
+    _joint(robot, NEEDLE, "tool", _ORIGIN, turning=False)
     sleeve = arm.sleeve
     reach = sleeve.along[2]
     look = _link(robot, SLEEVE, Inertial(sleeve.mass, (reach, 0.0, 0.0), 0.0, sleeve.inertia))
@@ -106,20 +111,19 @@ def _airframe(link: ET.Element, vehicle: Vehicle) -> None:
 def _bars(robot: ET.Element, vehicle: Vehicle) -> None:
     """The bars that the chain does without, where the parts of the vehicle say that they are."""
     arm, parts = vehicle.arm, {part.name: part for part in vehicle.arm.parts}
-    weightless = Inertial(1e-9, _ORIGIN, 0.0, (1e-12, 1e-12, 1e-12))
-    for name, angle in BARS:
+    for name in BARS:
         if name not in parts:
             continue
         part = parts[name]
         x, z = part.offset
-        if angle == 1:
+        if name == "level_rod_2":
             parent, origin = "elbow_plate", (x, 0.0, z)
         elif part.along[1] != 0.0:
             parent, origin = "crank", (part.along[1], 0.0, 0.0)
         else:
             parent, origin = "base", (arm.mount[0] + x, arm.mount[1], arm.mount[2] + z)
-        link = _link(robot, name, weightless)
-        _rod(link, _ORIGIN, (arm.link_1 if angle == 0 else arm.link_2, 0.0, 0.0), 0.003, "bar")
+        link = _link(robot, name, _WEIGHTLESS)
+        _rod(link, _ORIGIN, (arm.link_2 if parent == "elbow_plate" else arm.link_1, 0.0, 0.0), 0.003, "bar")
         _joint(robot, name, parent, origin)
 
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from drivers.samples import AutopilotCommand, Engage, Interface, JointMode, ServoCommand, Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.array_plant import PlantParams
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
-from sim_backend.rigid_body import PlantParams, RigidBody
+from sim_backend.rigid_body import RigidBody
 from sim_backend.world import World, WorldParams
 
 TICK = 0.004

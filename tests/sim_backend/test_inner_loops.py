@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from drivers.samples import FlightMode, Interface, Quat
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.array_plant import PlantParams, constants
 from sim_backend.autopilot import AutopilotParams, SetPoint
 from sim_backend.inner_loops import LoopParams, airframe_inertia, attitude_rate, mix, put_loops
-from sim_backend.rigid_body import PlantParams, constants
 from sim_backend.world import World, WorldParams
 from tests.sim_backend.flying import PIPE, RADIUS, mass_of
 
@@ -26,7 +26,7 @@ LIMIT = 13.0
 
 @pytest.fixture(scope="module")
 def p(vehicle: Vehicle) -> Array:
-    p = constants(vehicle, PlantParams(), PIPE, 0.0, RADIUS, 2.0)
+    p = constants(vehicle, PlantParams(), 1e-4, PIPE, 0.0, RADIUS, 2.0)
     put_loops(p, vehicle, LoopParams(), 1e-4)
     return p
 

@@ -1,0 +1,268 @@
+"""Vehicle, pipe, ground and sleeve in a Bullet of their own: what is simulated, shown on the screen, or pictured."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from math import pi
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from drivers.samples import Vec3
+from drivers.vehicle import Vehicle
+from sim_backend import layout as at
+from sim_backend.array_plant import PlantParams
+from sim_backend.lumping import DRIVEN, GEARS, SLEEVE
+from sim_backend.urdf import BARS, urdf
+
+#: Share of a gear's angle error that is taken back in one step.
+_GEAR_ERP = 0.2
+#: More than any gear carries, N m.
+_GEAR_MOST = 1e4
+
+
+def _load_bullet() -> Any:
+    """The pybullet module, without the line that it greets with. Raises ValueError where there is none."""
+    if "pybullet" in sys.modules:
+        return sys.modules["pybullet"]
+    kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
+    try:
+        return import_module("pybullet")
+    except ImportError as error:
+        raise ValueError(
+            "world.plant.kind = pybullet: PyBullet is not installed (pip install pybullet; there is no wheel for ARM); "
+            "or choose rigid"
+        ) from error
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
+
+
+class Scene:
+    """The bodies in one Bullet client. ``window`` shows them on the screen; ``bars`` adds the parallelograms' bars.
+
+    ``close`` gives the client back.
+    """
+
+    def __init__(self, vehicle: Vehicle, window: bool = False, bars: bool = False) -> None:
+        text = urdf(vehicle, bars)
+        self.bullet = bullet = _load_bullet()
+        self.client: int = bullet.connect(bullet.GUI if window else bullet.DIRECT)
+        if self.client < 0:
+            raise ValueError("world.plant.bullet.window: no window can be opened here; is there a screen?")
+        bullet.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
+        with TemporaryDirectory(prefix="pipewright-") as folder:
+            path = Path(folder) / "vehicle.urdf"
+            path.write_text(text, encoding="utf-8")
+            flags = bullet.URDF_USE_INERTIA_FROM_FILE | bullet.URDF_MAINTAIN_LINK_ORDER
+            self.vehicle: int = bullet.loadURDF(str(path), flags=flags, physicsClientId=self.client)
+        count = bullet.getNumJoints(self.vehicle, physicsClientId=self.client)
+        info = (bullet.getJointInfo(self.vehicle, i, physicsClientId=self.client) for i in range(count))
+        self._links: dict[str, int] = {row[12].decode(): row[0] for row in info}
+        self._count = count
+        #: The joints that the servos drive.
+        self.chain: list[int] = [self._links[name] for name in DRIVEN]
+        self._arm = vehicle.arm
+        plane = bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=self.client)
+        self.ground: int = bullet.createMultiBody(0.0, plane, physicsClientId=self.client)
+        self.pipe = -1
+        self.holds_sleeve = True
+        self.sleeve = -1
+        self._sliding = False
+        self._contact: tuple[float, ...] = ()
+
+    def close(self) -> None:
+        """Give the client back."""
+        if self.bullet.isConnected(self.client):
+            self.bullet.disconnect(self.client)
+
+    # -- physics ---------------------------------------------------------------------------------------------------
+
+    def prepare(self, params: PlantParams, step: float) -> None:
+        """Set what Bullet computes: step (s), gears, no damping of its own, contact of the ground."""
+        bullet, client, body, links = self.bullet, self.client, self.vehicle, self._links
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=step,
+            numSolverIterations=params.bullet.iterations,
+            numSubSteps=1,
+            solverResidualThreshold=0.0,
+            deterministicOverlappingPairs=1,
+            physicsClientId=client,
+        )
+        for link in range(-1, self._count):
+            bullet.changeDynamics(
+                body,
+                link,
+                linearDamping=0.0,
+                angularDamping=0.0,
+                jointDamping=0.0,
+                lateralFriction=1.0,
+                physicsClientId=client,
+            )
+        joints = list(range(self._count))
+        bullet.setJointMotorControlArray(
+            body, joints, bullet.VELOCITY_CONTROL, forces=[0.0] * self._count, physicsClientId=client
+        )
+        for name, sign, other in GEARS:
+            none = (0.0, 0.0, 0.0)
+            gear = bullet.createConstraint(
+                body, links[name], body, links[other], bullet.JOINT_GEAR, (0.0, 1.0, 0.0), none, none,
+                physicsClientId=client,
+            )  # fmt: skip
+            bullet.changeConstraint(
+                gear,
+                gearRatio=-sign,
+                erp=_GEAR_ERP,
+                relativePositionTarget=0.0,
+                maxForce=_GEAR_MOST,
+                physicsClientId=client,
+            )
+        ground = params.ground
+        bullet.changeDynamics(
+            self.ground,
+            -1,
+            contactStiffness=ground.stiffness,
+            contactDamping=ground.damping,
+            lateralFriction=ground.friction_kinetic,
+            restitution=0.0,
+            physicsClientId=client,
+        )
+        contact = params.contact
+        self._contact = (contact.stiffness, contact.damping, contact.friction_static, contact.friction_kinetic)
+
+    def put_pipe(self, position: Vec3, heading: float, radius: float, length: float) -> None:
+        """Lay the pipe: the middle of its axis (m), the heading it is square to (rad), radius and length (m)."""
+        bullet, client = self.bullet, self.client
+        shape = bullet.createCollisionShape(bullet.GEOM_CAPSULE, radius=radius, height=length, physicsClientId=client)
+        look = bullet.createVisualShape(
+            bullet.GEOM_CYLINDER,
+            radius=radius,
+            length=length,
+            rgbaColor=(0.55, 0.58, 0.60, 1.0),
+            physicsClientId=client,
+        )
+        self.pipe = bullet.createMultiBody(0.0, shape, look, position, self._across(heading), physicsClientId=client)
+        for link in range(-1, self._count):
+            touches = link == self._links["tool"]
+            bullet.setCollisionFilterPair(self.vehicle, self.pipe, link, -1, int(touches), physicsClientId=client)
+        if self._contact:
+            self._put_contact()
+
+    def _across(self, heading: float) -> tuple[float, float, float, float]:
+        """Takes the z axis to the left of a heading."""
+        turn: tuple[float, float, float, float] = self.bullet.getQuaternionFromEuler((-0.5 * pi, 0.0, heading))
+        return turn
+
+    def _put_contact(self) -> None:
+        """Stiffness, damping and friction of the pipe; on the pipe alone, since two bodies' stiffnesses are in series."""
+        stiffness, damping, static, kinetic = self._contact
+        self.bullet.changeDynamics(
+            self.pipe,
+            -1,
+            contactStiffness=stiffness,
+            contactDamping=damping,
+            lateralFriction=kinetic if self._sliding else static,
+            restitution=0.0,
+            physicsClientId=self.client,
+        )
+
+    def set_contacts(self, p: Sequence[float]) -> None:
+        """Take gravity and pipe (place and contact) anew from the constants of ``layout``."""
+        bullet, client = self.bullet, self.client
+        bullet.setGravity(0.0, 0.0, -p[at.GRAVITY], physicsClientId=client)
+        place = p[at.PIPE_POINT : at.PIPE_POINT + 3]
+        turn = bullet.getBasePositionAndOrientation(self.pipe, client)[1]
+        bullet.resetBasePositionAndOrientation(self.pipe, place, turn, physicsClientId=client)
+        self._contact = (
+            p[at.CONTACT_STIFFNESS], p[at.CONTACT_DAMPING], p[at.CONTACT_STATIC], p[at.CONTACT_KINETIC]
+        )  # fmt: skip
+        self._put_contact()
+
+    def set_sliding(self, sliding: bool) -> None:
+        """Have the pipe's friction be dynamic or static."""
+        if sliding is not self._sliding:
+            self._sliding = sliding
+            self._put_contact()
+
+    def velocity_of_tip(self) -> Vec3:
+        """Velocity of the gripper's tip, m/s, W."""
+        state = self.bullet.getLinkState(
+            self.vehicle, self._links["tool"], computeLinkVelocity=1, physicsClientId=self.client
+        )
+        (x, y, z), (cx, cy, cz), (i, j, k, w) = state[4], state[0], state[5]
+        reach = self._arm.gripper
+        tip_x = x + reach * (1.0 - 2.0 * (j * j + k * k)) - cx
+        tip_y = y + reach * 2.0 * (i * j + w * k) - cy
+        tip_z = z + reach * 2.0 * (i * k - w * j) - cz
+        (vx, vy, vz), (wx, wy, wz) = state[6], state[7]
+        return (vx + wy * tip_z - wz * tip_y, vy + wz * tip_x - wx * tip_z, vz + wx * tip_y - wy * tip_x)
+
+    # -- where things are ------------------------------------------------------------------------------------------
+
+    def place_vehicle(
+        self,
+        position: Sequence[float],
+        attitude: Sequence[float],
+        angles: Sequence[float],
+        rates: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Put the vehicle: position (m), attitude (x, y, z, w), absolute link angles (rad) and their rates (rad/s)."""
+        bullet, client, body = self.bullet, self.client, self.vehicle
+        bullet.resetBasePositionAndOrientation(body, position, attitude, physicsClientId=client)
+        chain = {
+            name: (angles[k] - (angles[k - 1] if k else 0.0), rates[k] - (rates[k - 1] if k else 0.0))
+            for k, name in enumerate(DRIVEN)
+        }
+        states = dict(chain)
+        for name, sign, other in GEARS:
+            states[name] = (sign * chain[other][0], sign * chain[other][1])
+        for name, (angle, turn) in states.items():
+            bullet.resetJointState(body, self._links[name], angle, turn, physicsClientId=client)
+
+    def place_bars(self, angles: Sequence[float]) -> None:
+        """Turn the bars that are there to look at, for absolute link angles (rad)."""
+        for name, angle in BARS.items():
+            if name in self._links:
+                value = angle[0] * angles[0] + angle[1] * angles[1]
+                self.bullet.resetJointState(self.vehicle, self._links[name], value, physicsClientId=self.client)
+
+    def release_sleeve(self, on_pipe: bool) -> None:
+        """Take the sleeve from the vehicle: it stays where it is on the pipe, or falls."""
+        bullet, client, body, link = self.bullet, self.client, self.vehicle, self._links[SLEEVE]
+        state = bullet.getLinkState(
+            body, link, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=client
+        )
+        mass, inertia = self.take_sleeve()
+        half = (0.02, 0.05, 0.035)
+        shape = (
+            -1 if on_pipe else bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
+        )
+        look = bullet.createVisualShape(
+            bullet.GEOM_BOX, halfExtents=half, rgbaColor=(0.15, 0.65, 0.40, 1.0), physicsClientId=client
+        )
+        self.sleeve = bullet.createMultiBody(
+            0.0 if on_pipe else mass, shape, look, state[0], state[1], physicsClientId=client
+        )
+        if not on_pipe:
+            bullet.changeDynamics(
+                self.sleeve, -1, localInertiaDiagonal=inertia, linearDamping=0.0, angularDamping=0.0,
+                physicsClientId=client,
+            )  # fmt: skip
+            bullet.resetBaseVelocity(self.sleeve, state[6], state[7], physicsClientId=client)
+            for other in range(-1, self._count):
+                bullet.setCollisionFilterPair(body, self.sleeve, other, -1, 0, physicsClientId=client)
+
+    def take_sleeve(self) -> tuple[float, Vec3]:
+        """Take mass and look of the sleeve from the gripper; gives what they were."""
+        sleeve, link = self._arm.sleeve, self._links[SLEEVE]
+        self.holds_sleeve = False
+        self.bullet.changeDynamics(
+            self.vehicle, link, mass=0.0, localInertiaDiagonal=(0.0, 0.0, 0.0), physicsClientId=self.client
+        )
+        self.bullet.changeVisualShape(self.vehicle, link, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=self.client)
+        return sleeve.mass, sleeve.inertia
