@@ -132,7 +132,7 @@ def _pose(run: Run, tick: int) -> Pose:
 
 
 class _Studio:
-    """A scene with the run's vehicle and pipe, and a camera that keeps the vehicle in sight. Time only goes on in it."""
+    """The run's vehicle and pipe, and a camera that keeps the vehicle in sight. Time only goes on in it."""
 
     def __init__(self, run: Run, width: int) -> None:
         import msgspec

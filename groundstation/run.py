@@ -146,6 +146,14 @@ class _Vehicle(Struct):
     servo: _Servo
 
 
+class _Plant(Struct):
+    kind: str = "rigid"
+
+
+class _World(Struct):
+    plant: _Plant = _Plant()
+
+
 class RunConfig(Struct):
     """The parameters that figures of merit are measured against."""
 
@@ -153,6 +161,7 @@ class RunConfig(Struct):
     repair: Repair
     plan: _Plan
     vehicle: _Vehicle
+    world: _World = _World()
 
 
 class _Revision(Struct):

@@ -69,6 +69,11 @@ class PlantParams(Struct, frozen=True, forbid_unknown_fields=True):
     contact: ContactParams = ContactParams()
     ground: GroundParams = GroundParams()
 
+    @property
+    def physics_step(self) -> float:
+        """Step of the plant that is chosen, s."""
+        return self.step if self.kind is PlantKind.RIGID else self.bullet.step
+
 
 def constants(
     vehicle: Vehicle,
@@ -129,7 +134,6 @@ class ArrayPlant(ABC):
         self,
         vehicle: Vehicle,
         params: PlantParams,
-        step: float,
         pipe_position: Vec3,
         pipe_heading: float,
         pipe_radius: float,
@@ -138,8 +142,8 @@ class ArrayPlant(ABC):
         self.vehicle = vehicle
         self.params = params
         #: Physics step, s.
-        self.step = step
-        self.p = constants(vehicle, params, step, pipe_position, pipe_heading, pipe_radius, pipe_length)
+        self.step = params.physics_step
+        self.p = constants(vehicle, params, self.step, pipe_position, pipe_heading, pipe_radius, pipe_length)
         self.x = np.zeros(at.STATE_SIZE)
         self.u = np.zeros(at.DRIVE_SIZE)
         self.steps = 0

@@ -159,7 +159,7 @@ class Scene:
         return turn
 
     def _put_contact(self) -> None:
-        """Stiffness, damping and friction of the pipe; on the pipe alone, since two bodies' stiffnesses are in series."""
+        """Stiffness, damping and friction of the pipe; of it alone, since two bodies' stiffnesses are in series."""
         stiffness, damping, static, kinetic = self._contact
         self.bullet.changeDynamics(
             self.pipe,
@@ -233,29 +233,31 @@ class Scene:
 
     def release_sleeve(self, on_pipe: bool) -> None:
         """Take the sleeve from the vehicle: it stays where it is on the pipe, or falls."""
-        bullet, client, body, link = self.bullet, self.client, self.vehicle, self._links[SLEEVE]
-        state = bullet.getLinkState(
-            body, link, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=client
-        )
+        bullet, client, body = self.bullet, self.client, self.vehicle
+        state = bullet.getLinkState(body, self._links[SLEEVE], 1, 1, physicsClientId=client)
         mass, inertia = self.take_sleeve()
         half = (0.02, 0.05, 0.035)
-        shape = (
-            -1 if on_pipe else bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
-        )
+        shape = -1
+        if not on_pipe:
+            shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
         look = bullet.createVisualShape(
-            bullet.GEOM_BOX, halfExtents=half, rgbaColor=(0.15, 0.65, 0.40, 1.0), physicsClientId=client
+            bullet.GEOM_BOX,
+            halfExtents=half,
+            rgbaColor=(0.15, 0.65, 0.40, 1.0),
+            visualFramePosition=(self._arm.gripper - 0.02 - self._arm.sleeve.along[2], 0.0, 0.0),
+            physicsClientId=client,
         )
         self.sleeve = bullet.createMultiBody(
             0.0 if on_pipe else mass, shape, look, state[0], state[1], physicsClientId=client
         )
-        if not on_pipe:
-            bullet.changeDynamics(
-                self.sleeve, -1, localInertiaDiagonal=inertia, linearDamping=0.0, angularDamping=0.0,
-                physicsClientId=client,
-            )  # fmt: skip
-            bullet.resetBaseVelocity(self.sleeve, state[6], state[7], physicsClientId=client)
-            for other in range(-1, self._count):
-                bullet.setCollisionFilterPair(body, self.sleeve, other, -1, 0, physicsClientId=client)
+        if on_pipe:
+            return
+        bullet.changeDynamics(
+            self.sleeve, -1, localInertiaDiagonal=inertia, linearDamping=0.0, angularDamping=0.0, physicsClientId=client
+        )
+        bullet.resetBaseVelocity(self.sleeve, state[6], state[7], physicsClientId=client)
+        for other in range(-1, self._count):
+            bullet.setCollisionFilterPair(body, self.sleeve, other, -1, 0, physicsClientId=client)
 
     def take_sleeve(self) -> tuple[float, Vec3]:
         """Take mass and look of the sleeve from the gripper; gives what they were."""

@@ -142,12 +142,11 @@ class PyBulletPlant(ArrayPlant):
         pipe_radius: float,
         pipe_length: float = 2.0,
     ) -> None:
-        step = params.bullet.step
-        super().__init__(vehicle, params, step, pipe_position, pipe_heading, pipe_radius, pipe_length)
+        super().__init__(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length)
         self.scene = scene = Scene(vehicle, window=params.bullet.window)
         self._finalizer = weakref.finalize(self, scene.close)
         self._bullet: Any = scene.bullet
-        scene.prepare(params, step)
+        scene.prepare(params, self.step)
         scene.put_pipe(pipe_position, pipe_heading, pipe_radius, pipe_length)
         self._out = np.zeros(_DRIVE_SIZE)
         self._moved = np.zeros(_MOVED_SIZE)

@@ -343,7 +343,7 @@ class RigidBody(ArrayPlant):
         pipe_radius: float,
         pipe_length: float = 2.0,
     ) -> None:
-        super().__init__(vehicle, params, params.step, pipe_position, pipe_heading, pipe_radius, pipe_length)
+        super().__init__(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length)
         self.stand()
 
     def move(self, steps: int) -> None:

@@ -78,7 +78,7 @@ def fly(config: Config, longest: float | None = None) -> tuple[Flight, list[Tick
         wall = (perf_counter_ns() - start) * 1e-9
         size = log.stat().st_size
     sim_s = ticks[-1].inputs.t_ns * 1e-9
-    step = config.world.plant.step
+    step = config.world.plant.physics_step
     advancing = sum(world.spans) * 1e-9
     return (
         Flight(
