@@ -26,7 +26,7 @@ _GEAR_MOST = 1e4
 
 def _load_bullet() -> Any:
     """The pybullet module, without the line that it greets with. Raises ValueError where there is none."""
-    if "pybullet" in sys.modules:
+    if sys.modules.get("pybullet") is not None:
         return sys.modules["pybullet"]
     kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 2)
