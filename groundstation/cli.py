@@ -167,21 +167,8 @@ def _parser() -> argparse.ArgumentParser:
     for command in (sim, desk, onboard):
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
-    for group in (
-        status,
-        watch,
-        estop,
-        preflight,
-        lease,
-        orders,
-        events,
-        params,
-        logs,
-        calibrate,
-        keys,
-        completion,
-        film,
-    ):
+    of_vehicle = (status, watch, estop, preflight, lease, orders, events, params, logs)
+    for group in (*of_vehicle, calibrate, keys, completion, film):
         group.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")

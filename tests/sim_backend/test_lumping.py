@@ -1,4 +1,4 @@
-"""The bodies and gears of the PyBullet world are the vehicle: one step of the engine against the equations of motion."""
+"""The bodies and gears of the PyBullet world are the vehicle: single steps against the equations of motion."""
 
 from __future__ import annotations
 

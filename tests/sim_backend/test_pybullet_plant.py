@@ -156,5 +156,5 @@ def test_a_hard_landing_breaks_it(vehicle: Vehicle, height: float, breaks: bool)
 
 def test_without_pybullet_it_says_what_to_do(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(ValueError, match="PyBullet is not installed .* or choose rigid"):
+    with pytest.raises(ValueError, match=r"PyBullet is not installed .* or choose rigid"):
         World(vehicle, WorldParams(plant=BULLET), PIPE, 0.0, RADIUS)
