@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from groundstation.run import Run
     from sim_backend.bullet_scene import Scene
 
-#: Names of what is written into the folder.
-FILM, SHEET = "film.gif", "phases.png"
+#: The folder beside a log, and names of what is written into it. ``pipewright report`` shows them.
+FOLDER, FILM, SHEET = "film", "film.gif", "phases.png"
 _EPILOG = """\
 examples:
   pipewright film runs/paper-tuned                 into runs/paper-tuned/film
@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
     log = options.log / "log.mcap" if options.log.is_dir() else options.log
     try:
         flown = read_run(log, partial=options.partial)
-        out: Path = options.out or log.parent / "film"
+        out: Path = options.out or log.parent / FOLDER
         with _Studio(flown, options.width) as studio:
             out.mkdir(parents=True, exist_ok=True)
             written, sheet = _write_phases(studio, flown, out)

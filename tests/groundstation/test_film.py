@@ -58,7 +58,11 @@ def test_each_phase_gets_a_picture_and_the_film_moves(log: Path, capsys: pytest.
     [(["nowhere.mcap"], "nowhere.mcap"), (["x", "--width", "10"], "160 to 1920"), (["x", "--speed", "0"], "above 0")],
 )
 def test_wrong_input_is_told(
-    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: list[str],
+    words: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     try:
