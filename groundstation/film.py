@@ -13,7 +13,8 @@ from groundstation import codes
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture
 
-    from groundstation.run import Run
+    from drivers.samples import Vec3
+    from groundstation.run import Array, Run
     from sim_backend.bullet_scene import Scene
 
 #: The folder beside a log, and names of what is written into it. ``pipewright report`` shows them.
@@ -37,10 +38,10 @@ class Pose(NamedTuple):
 
     t: float
     phase: str
-    position: tuple[float, float, float]
-    attitude: tuple[float, float, float]
+    position: Vec3
+    attitude: Vec3
     """Roll, pitch, yaw, rad."""
-    joints: tuple[float, float, float]
+    joints: Vec3
     force: float
     """On the pipe, N."""
     payload: bool
@@ -123,12 +124,16 @@ def _pose(run: Run, tick: int) -> Pose:
     return Pose(
         float(run.t[tick]),
         str(run.phase[tick]),
-        tuple(state.p[tick].tolist()),
-        tuple(state.rpy[tick].tolist()),
-        tuple(state.joints[tick].tolist()),
+        _three(state.p[tick]),
+        _three(state.rpy[tick]),
+        _three(state.joints[tick]),
         float(force[tick]),
         bool(run.payload[tick]),
     )
+
+
+def _three(row: Array) -> Vec3:
+    return (float(row[0]), float(row[1]), float(row[2]))
 
 
 class _Studio:

@@ -24,8 +24,12 @@ _GEAR_ERP = 0.2
 _GEAR_MOST = 1e4
 
 
+class NoBulletError(ValueError):
+    """There is no PyBullet on this machine, or no window for it."""
+
+
 def _load_bullet() -> Any:
-    """The pybullet module, without the line that it greets with. Raises ValueError where there is none."""
+    """The pybullet module, without the line that it greets with. Raises NoBulletError where there is none."""
     if sys.modules.get("pybullet") is not None:
         return sys.modules["pybullet"]
     kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
@@ -33,10 +37,7 @@ def _load_bullet() -> Any:
     try:
         return import_module("pybullet")
     except ImportError as error:
-        raise ValueError(
-            "world.plant.kind = pybullet: PyBullet is not installed (pip install pybullet; there is no wheel for ARM); "
-            "or choose rigid"
-        ) from error
+        raise NoBulletError("PyBullet is not installed (pip install pybullet; it has no wheel for ARM)") from error
     finally:
         os.dup2(kept, 2)
         os.close(kept)
@@ -46,7 +47,7 @@ def _load_bullet() -> Any:
 class Scene:
     """The bodies in one Bullet client. ``window`` shows them on the screen; ``bars`` adds the parallelograms' bars.
 
-    ``close`` gives the client back.
+    ``close`` gives the client back. Raises NoBulletError; ValueError for an arm that has no URDF.
     """
 
     def __init__(self, vehicle: Vehicle, window: bool = False, bars: bool = False) -> None:
@@ -54,7 +55,7 @@ class Scene:
         self.bullet = bullet = _load_bullet()
         self.client: int = bullet.connect(bullet.GUI if window else bullet.DIRECT)
         if self.client < 0:
-            raise ValueError("world.plant.bullet.window: no window can be opened here; is there a screen?")
+            raise NoBulletError("bullet.window: no window can be opened here; is there a screen?")
         bullet.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
         with TemporaryDirectory(prefix="pipewright-") as folder:
             path = Path(folder) / "vehicle.urdf"

@@ -18,7 +18,7 @@ from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.array_plant import ArrayPlant, PlantParams
-from sim_backend.bullet_scene import Scene
+from sim_backend.bullet_scene import NoBulletError, Scene
 from sim_backend.compiled import compiled
 from sim_backend.contact import FREE, SLIDE, STICK
 from sim_backend.inner_loops import inner_loops
@@ -143,7 +143,10 @@ class PyBulletPlant(ArrayPlant):
         pipe_length: float = 2.0,
     ) -> None:
         super().__init__(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length)
-        self.scene = scene = Scene(vehicle, window=params.bullet.window)
+        try:
+            self.scene = scene = Scene(vehicle, window=params.bullet.window)
+        except NoBulletError as error:
+            raise ValueError(f"world.plant.kind = pybullet: {error}; or choose rigid") from error
         self._finalizer = weakref.finalize(self, scene.close)
         self._bullet: Any = scene.bullet
         scene.prepare(params, self.step)

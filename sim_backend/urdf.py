@@ -10,7 +10,7 @@ from drivers.vehicle import Vehicle
 from sim_backend.lumping import SHOULDER, SLEEVE, Inertial, bodies, inertial
 
 #: Radius of the balls that touch pipe or ground, m.
-TOUCH_RADIUS = 0.004
+TOUCH_RADIUS = 0.002
 #: Links that are only there to look at; each one's joint turns by so much of theta_1 and theta_2.
 BARS = {"rod": (1.0, -1.0), "level_rod_1": (1.0, 0.0), "level_rod_2": (0.0, 1.0)}
 #: The link with the needle's tip.
