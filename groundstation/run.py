@@ -146,11 +146,11 @@ class _Vehicle(Struct):
     servo: _Servo
 
 
-class _Plant(Struct):
+class _Plant(Struct, frozen=True):
     kind: str = "rigid"
 
 
-class _World(Struct):
+class _World(Struct, frozen=True):
     plant: _Plant = _Plant()
 
 
