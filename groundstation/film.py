@@ -145,7 +145,7 @@ class _Studio:
 
         from drivers.vehicle import Vehicle
         from sim_backend.bullet_scene import Scene
-        from sim_backend.picture import Camera, lay_floor
+        from sim_backend.picture import Camera
 
         # A run's configuration was checked when it was flown.
         vehicle = msgspec.convert(yaml.safe_load(run.config_yaml)["vehicle"], Vehicle)
@@ -156,7 +156,6 @@ class _Studio:
         self.size = (width, round(width * 9 / 16))
         self.scene: Scene = Scene(vehicle, bars=True)
         self.scene.put_pipe(pipe.position, radians(pipe.heading_deg), pipe.radius, pipe.length)
-        lay_floor(self.scene, pipe.position)
         self._camera = Camera(self.scene, *self.size)
 
     def __enter__(self) -> _Studio:
@@ -190,7 +189,7 @@ class _Studio:
             pose.position[1] + lead * sin(ahead),
             pose.position[2] - 0.05,
         )
-        view = View(target, 2.4 - 0.9 * near, self._heading + 30.0 - 25.0 * near, -14.0 + 6.0 * near)
+        view = View(target, 1.8 - 0.6 * near, self._heading + 30.0 - 25.0 * near, -14.0 + 6.0 * near)
         picture = Image.fromarray(self._camera.take(view))
         draw = ImageDraw.Draw(picture)
         font = ImageFont.load_default(size=15)

@@ -13,8 +13,6 @@ from sim_backend.bullet_scene import Scene
 
 Image = NDArray[np.uint8]
 
-_FLOOR, _LINES = (0.78, 0.80, 0.78, 1.0), (0.66, 0.69, 0.66, 1.0)
-
 
 class View(Struct, frozen=True):
     """Where a picture is taken from."""
@@ -54,18 +52,3 @@ class Camera:
         )
         rgba: Any = np.asarray(pixels, dtype=np.uint8).reshape(self._height, self._width, 4)
         return np.ascontiguousarray(rgba[:, :, :3])
-
-
-def lay_floor(scene: Scene, middle: Vec3, half: int = 4) -> None:
-    """A floor to look at about a place, with a line each metre."""
-    bullet, client = scene.bullet, scene.client
-
-    def slab(size: tuple[float, float, float], at: Vec3, colour: tuple[float, float, float, float]) -> None:
-        look = bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=size, rgbaColor=colour, physicsClientId=client)
-        bullet.createMultiBody(0.0, -1, look, at, physicsClientId=client)
-
-    x, y = float(round(middle[0])), float(round(middle[1]))
-    slab((half, half, 0.01), (x, y, -0.012), _FLOOR)
-    for k in range(-half, half + 1):
-        slab((0.008, half, 0.001), (x + k, y, 0.0), _LINES)
-        slab((half, 0.008, 0.001), (x, y + k, 0.0), _LINES)
