@@ -26,6 +26,7 @@ def plants(vehicle: Vehicle) -> tuple[RigidBody, PyBulletPlant]:
 
 def test_it_stands_as_the_other_does(vehicle: Vehicle) -> None:
     rigid, bullet = plants(vehicle)
+    bullet.begin()
     bullet.move(400)
     bullet.count(400)
     one, other = rigid.truth(), bullet.truth()
