@@ -63,7 +63,7 @@ def test_both_fall_alike(vehicle: Vehicle) -> None:
 def flown(vehicle: Vehicle, plant: PlantParams, joints: Vec3) -> list[tuple[float, ...]]:
     """Take off, hover, then swing the arm in flight: position, attitude and joints, each 20 ms."""
     hand = Hand(World(vehicle, WorldParams(plant=plant), PIPE, 0.0, RADIUS))
-    rows = []
+    rows: list[tuple[float, ...]] = []
     for k in range(1500):
         if k == 1000:
             hand.joints = joints
