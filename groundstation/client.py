@@ -13,6 +13,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from datetime import UTC, datetime
 from getpass import getuser
 from queue import Empty, SimpleQueue
 from threading import Condition, Thread
@@ -85,6 +86,16 @@ class Contact(Struct, frozen=True):
     """Events that it told and that never came."""
     pulse: VehiclePulse | None = None
     """The newest."""
+
+    def when(self, t_ns: int) -> datetime | None:
+        """UTC of a time on the vehicle's monotonic clock, by our clock: the vehicle's stops without power.
+
+        By the vehicle's own while the offset is not known; None before its first pulse.
+        """
+        if self.pulse is None:
+            return None
+        offset = self.clock_offset if math.isfinite(self.clock_offset) else 0.0
+        return datetime.fromtimestamp((t_ns + self.pulse.wall_ns - self.pulse.sent_ns) * 1e-9 - offset, UTC)
 
 
 def default_name() -> str:

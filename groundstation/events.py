@@ -6,7 +6,7 @@ import argparse
 import math
 import time
 from collections.abc import Collection
-from datetime import UTC, datetime
+from datetime import datetime
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
@@ -115,8 +115,5 @@ def as_data(told: Told, contact: Contact) -> dict[str, Any]:
 
 
 def _time(told: Told, contact: Contact) -> datetime | None:
-    """When it was told, by our clock: the vehicle's may be wrong, it has none that runs without power."""
-    if contact.pulse is None or math.isnan(contact.clock_offset):
-        return None
-    wall_ns = told.event.t_ns + contact.pulse.wall_ns - contact.pulse.sent_ns
-    return datetime.fromtimestamp(wall_ns * 1e-9 - contact.clock_offset, UTC)
+    """When it was told; None while that is known by the vehicle's clock alone."""
+    return None if math.isnan(contact.clock_offset) else contact.when(told.event.t_ns)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from datetime import datetime
 from typing import Final
 
 from drivers.samples import SERVO_NAMES
@@ -361,10 +360,6 @@ def _row(label: str, *spans: Span) -> Line:
 
 
 def _clock(view: View, t_ns: int) -> str:
-    """Local time of a moment on the vehicle's clock, by the clock of this machine where the offset is known."""
-    pulse = view.contact.pulse
-    if pulse is None:
-        return "--:--:--"
-    offset = view.contact.clock_offset
-    utc = (pulse.wall_ns - pulse.sent_ns + t_ns) * 1e-9 - (offset if math.isfinite(offset) else 0.0)
-    return datetime.fromtimestamp(utc).astimezone().strftime("%H:%M:%S")
+    """Local time of a moment on the vehicle's clock."""
+    when = view.contact.when(t_ns)
+    return "--:--:--" if when is None else f"{when.astimezone():%H:%M:%S}"

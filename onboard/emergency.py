@@ -82,16 +82,13 @@ class Emergency:
 
     # -- from any thread ----------------------------------------------------------------------------------------------
 
-    def kill(self, done: Done | None = None) -> None:
-        """Cut the motors and the servos' torque now, and keep them so until ``release``.
-
-        done: called by the loop with what came of the tick that took the request, if it still ticks.
-        """
+    def kill(self) -> None:
+        """Cut the motors and the servos' torque now, and keep them so until ``release``."""
         new = not self.killed
         self._want(Engage.KILL, instead_of=(None, Engage.LAND, Engage.KILL))
         self._wake.set()
         self._insist()
-        self._guarded("the loop", partial(self._request, Request.KILL, done=done))
+        self._guarded("the loop", partial(self._request, Request.KILL))
         if new:
             self._teller.tell(Level.WARNING, "killed: the motors and the servos' torque are cut until a reset.")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from enum import StrEnum
-from math import cos, floor, hypot, isfinite, sin
+from math import cos, floor, hypot, isfinite, pi, sin, sqrt
 from typing import Annotated
 
 import numpy as np
@@ -15,6 +15,7 @@ from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.contact import SLIDE, ContactParams, GroundParams
+from sim_backend.deviations import AS_MODELLED, Deviations
 from sim_backend.dynamics import lump
 from sim_backend.knob import knob, switch
 from sim_backend.motors import lag_gain, rated_voltage
@@ -64,6 +65,23 @@ class PlantParams(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.02
     stop_stiffness: Annotated[float, knob("N m/rad", "mechanical stops of the joints", 1.0, 200.0)] = 50.0
     stop_damping: Annotated[float, knob("N m s/rad", "mechanical stops of the joints", 0.0, 5.0)] = 0.5
+    motor_lag: Annotated[
+        float, knob("s", "thrust lag in place of the vehicle file's; 0: as ``ideal_motors`` says", 0.0, 0.5)
+    ] = 0.0
+    battery_sag: Annotated[
+        float, knob("1", "share of the thrust's fall with the voltage squared that no map makes up for", 0.0, 1.0)
+    ] = 0.0
+    rotor_constant: Annotated[float, knob("N s^2", "thrust of a rotor over its speed squared", 1e-6, 1e-3)] = 1.37e-5
+    rotor_drag: Annotated[
+        float, knob("N s^2/m", "drag of a rotor in its plane, over its speed and that of the air", 0.0, 1e-2)
+    ] = 0.0
+    ground_effect: Annotated[float, knob("1", "share of Cheeseman and Bennett's gain of thrust", 0.0, 2.0)] = 0.0
+    wall_effect: Annotated[
+        float, knob("1", "share of a rotor's thrust that pulls it to the pipe at one radius from it", 0.0, 0.5)
+    ] = 0.0
+    backlash: Annotated[float, knob("rad", "play of the joint servos' gears, end to end", 0.0, 0.1)] = 0.0
+    gear_stiffness: Annotated[float, knob("N m/rad", "of the teeth where there is play", 10.0, 1e3)] = 200.0
+    gear_damping: Annotated[float, knob("N m s/rad", "of the teeth where there is play", 0.0, 5.0)] = 0.3
     start_joints: tuple[StartAngle, StartAngle, StartAngle] = (-2.80, -0.35, 0.0)
     """The arm folded above the ground."""
     contact: ContactParams = ContactParams()
@@ -74,20 +92,26 @@ class PlantParams(Struct, frozen=True, forbid_unknown_fields=True):
         """Step of the plant that is chosen, s."""
         return self.step if self.kind is PlantKind.RIGID else self.bullet.step
 
+    def rotor_inertia(self, vehicle: Vehicle) -> float:
+        """What of a joint servo's rotor weighs on its joint, kg m^2: with play it is a side of its own (servos.py)."""
+        return 0.0 if self.backlash else vehicle.servo.rotor_inertia
+
 
 def constants(
     vehicle: Vehicle,
     params: PlantParams,
-    step: float,
     pipe_position: Vec3,
     pipe_heading: float,
     pipe_radius: float,
     pipe_length: float,
+    truth: Deviations = AS_MODELLED,
 ) -> Array:
-    """Array ``p`` for a vehicle, a physics step (s) and a pipe (without the autopilot's gains)."""
+    """Array ``p`` for a vehicle and a pipe (without the autopilot's gains), both off by ``truth``."""
     p = np.zeros(at.CONSTANTS_SIZE)
+    centre, vehicle = truth.base_centre(vehicle), truth.vehicle(vehicle)
+    pipe_position, pipe_heading = truth.pipe_pose(pipe_position, pipe_heading)
     base, rotor, arm, servo, cell = vehicle.base, vehicle.rotors, vehicle.arm, vehicle.servo, vehicle.battery
-    contact, ground = params.contact, params.ground
+    contact, ground, step = params.contact, params.ground, params.physics_step
 
     def put(index: int, *values: float) -> None:
         p[index : index + len(values)] = values
@@ -95,16 +119,24 @@ def constants(
     put(at.STEP, step, vehicle.gravity, *base.drag, *arm.mount, arm.link_1, arm.link_2, arm.gripper, arm.needle)
     put(at.JOINT_MIN, *arm.joint_min, *arm.joint_max, params.stop_stiffness, params.stop_damping)
     put(at.ROTOR_X, rotor.arm_x, rotor.arm_y, rotor.max_thrust, rotor.torque_per_thrust)
-    put(at.ROTOR_GAIN, lag_gain(step, 0.0 if params.ideal_motors else rotor.time_constant), rotor.radius)
+    lag = params.motor_lag or (0.0 if params.ideal_motors else rotor.time_constant)
+    put(at.ROTOR_GAIN, lag_gain(step, lag), rotor.radius)
+    put(at.ROTOR_SCALE, truth.thrust, params.battery_sag, cell.full_voltage - cell.resistance * cell.hover_current)
+    put(at.SPIN, 1.0 / sqrt(params.rotor_constant), params.rotor_drag, params.ground_effect, params.wall_effect)
     put(at.STALL_TORQUE, servo.stall_torque, servo.stall_current, servo.no_load_speed)
     put(at.FRICTION_STATIC, servo.friction_static, servo.friction_viscous, params.friction_speed)
     put(at.SERVO_STIFFNESS, servo.stiffness, servo.damping, float(params.ideal_servos))
+    put(at.BACKLASH, 0.5 * params.backlash, params.gear_stiffness, params.gear_damping, servo.rotor_inertia)
     put(at.TOOL_SERVO_GAIN, lag_gain(step, params.tool_servo_time))
     put(at.PIPE_POINT, *pipe_position, cos(pipe_heading), sin(pipe_heading), pipe_radius)
     put(at.PIPE_HALF_LENGTH, 0.5 * pipe_length)
     put(at.CONTACT_STIFFNESS, contact.stiffness, contact.damping)
     put(at.CONTACT_TANGENTIAL_STIFFNESS, contact.tangential_stiffness, contact.tangential_damping)
     put(at.CONTACT_STATIC, contact.friction_static, contact.friction_kinetic, contact.release_angle)
+    put(at.UNEVENNESS, contact.unevenness)
+    for i, (way, number, phase) in enumerate(truth.waves):
+        size = 2.0 * pi * number / contact.patch
+        put(at.WAVE + 3 * i, size * cos(way), size * sin(way), phase)
     put(at.GROUND_STIFFNESS, ground.stiffness, ground.damping)
     put(at.GROUND_TANGENTIAL_STIFFNESS, ground.tangential_stiffness, ground.tangential_damping)
     put(at.GROUND_STATIC, ground.friction_static, ground.friction_kinetic, ground.crash_speed)
@@ -117,7 +149,7 @@ def constants(
     put(at.HOVER_CURRENT, cell.hover_current, mass * vehicle.gravity)
     put(at.RATED_VOLTAGE, 0.0 if params.ideal_motors else rated_voltage(cell))
     for i in range(2):
-        put(at.LUMPED + i * at.LUMPED_SIZE, *lump(vehicle, parts[i], servo.rotor_inertia))
+        put(at.LUMPED + i * at.LUMPED_SIZE, *lump(vehicle, parts[i], params.rotor_inertia(vehicle), centre))
     return p
 
 
@@ -126,8 +158,9 @@ class ArrayPlant(ABC):
 
     It starts standing at the origin of W, at rest, arm folded and held by its servos, sleeve in the gripper.
     ``pipe_position`` (m, W) is the middle of the pipe's axis, ``pipe_heading`` (rad) the horizontal direction in
-    which the vehicle presses, to which the axis is square; ``pipe_radius`` and ``pipe_length`` in m. What is written
-    into the arrays between two advances holds.
+    which the vehicle presses, to which the axis is square; ``pipe_radius`` and ``pipe_length`` in m. Vehicle and pipe
+    are those of the model; they really are off by ``truth``. What is written into the arrays between two advances
+    holds.
     """
 
     def __init__(
@@ -138,12 +171,13 @@ class ArrayPlant(ABC):
         pipe_heading: float,
         pipe_radius: float,
         pipe_length: float,
+        truth: Deviations = AS_MODELLED,
     ) -> None:
         self.vehicle = vehicle
         self.params = params
         #: Physics step, s.
         self.step = params.physics_step
-        self.p = constants(vehicle, params, self.step, pipe_position, pipe_heading, pipe_radius, pipe_length)
+        self.p = constants(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
         self.x = np.zeros(at.STATE_SIZE)
         self.u = np.zeros(at.DRIVE_SIZE)
         self.steps = 0

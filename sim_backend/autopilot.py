@@ -23,6 +23,10 @@ class AutopilotParams(Struct, frozen=True, forbid_unknown_fields=True):
     """Timing of the simulated autopilot."""
 
     command_delay: Annotated[float, knob("s", "set-point to inner loop, attitude and body rate", 0.0, 0.2)] = 0.012
+    command_jitter: Annotated[
+        float, knob("s", "mean of the exponential rest of that delay; order is kept", 0.0, 0.1)
+    ] = 0.0
+    command_loss: Annotated[float, knob("1", "share of the set-points that never arrive", 0.0, 0.9)] = 0.0
     wrench_delay: Annotated[float, knob("s", "set-point to mixer, wrench", 0.0, 0.2)] = 0.0
     arm_delay: Annotated[float, knob("s", "stream of set-points needed before arming and offboard", 0.0, 5.0)] = 0.5
     offboard_timeout: Annotated[float, knob("s", "COM_OF_LOSS_T: silence after which it lands", 0.1, 5.0)] = 0.5
@@ -88,14 +92,16 @@ def _drive(u: Array, demand: SetPoint | Descent | Rotors | None) -> None:
 class Autopilot:
     """Arming, modes and failsafe. Times are simulated seconds. Starts disarmed, landed, in mode HOLD."""
 
-    def __init__(self, params: AutopilotParams) -> None:
+    def __init__(self, params: AutopilotParams, seed: int = 0) -> None:
         self.params = params
+        self._random = np.random.default_rng([seed, 14540])
         self.armed = False
         self.mode = FlightMode.HOLD
         self.landed = Landed.ON_GROUND
         self.killed = False
         self._rotors: Rotors | None = None
         self._pending: deque[tuple[float, SetPoint]] = deque()
+        self._last_due = -inf
         self._setpoint: SetPoint | None = None
         self._stream_start = 0.0
         self._stream_last = -inf
@@ -114,16 +120,21 @@ class Autopilot:
     def offer(self, t: float, setpoint: SetPoint) -> None:
         """Take one set-point, received at ``t``; it reaches the loops after the interface's delay.
 
-        One that holds a number that is not finite is ignored, as PX4 does.
+        One that holds a number that is not finite is ignored, as PX4 does; some are lost on the way.
         """
         s, params = setpoint, self.params
         if not isfinite(s.thrust + sum(s.torque_B) + sum(s.q_WB) + sum(s.w_WB_B)):
+            return
+        lost, more = self._random.random(), float(self._random.standard_exponential())
+        if lost < params.command_loss:
             return
         if t - self._stream_last > params.offboard_timeout:
             self._stream_start = t
         self._stream_last = t
         delay = params.wrench_delay if s.interface is Interface.WRENCH else params.command_delay
-        self._pending.append((t + delay, s))
+        delay += params.command_jitter * more
+        self._last_due = max(self._last_due, t + delay)
+        self._pending.append((self._last_due, s))
 
     def streaming(self, t: float) -> bool:
         """Set-points have come for long enough, and still come: arming and offboard are accepted."""

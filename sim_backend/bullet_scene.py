@@ -15,7 +15,7 @@ from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.array_plant import PlantParams
-from sim_backend.lumping import DRIVEN, GEARS, SLEEVE
+from sim_backend.lumping import DRIVEN, SLEEVE, gears
 from sim_backend.urdf import BARS, urdf
 
 #: Share of a gear's angle error that is taken back in one step.
@@ -47,11 +47,15 @@ def _load_bullet() -> Any:
 class Scene:
     """The bodies in one Bullet client. ``window`` shows them on the screen; ``bars`` adds the parallelograms' bars.
 
+    ``centre`` is the base's centre of mass, m, B: where Bullet has the base, whose origin is what we tell.
     ``close`` gives the client back. Raises NoBulletError; ValueError for an arm that has no URDF.
     """
 
-    def __init__(self, vehicle: Vehicle, window: bool = False, bars: bool = False) -> None:
-        text = urdf(vehicle, bars)
+    def __init__(
+        self, vehicle: Vehicle, window: bool = False, bars: bool = False, centre: Vec3 = (0.0, 0.0, 0.0)
+    ) -> None:
+        text = urdf(vehicle, bars, centre)
+        self.centre = centre
         self.bullet = bullet = _load_bullet()
         self.client: int = bullet.connect(bullet.GUI if window else bullet.DIRECT)
         if self.client < 0:
@@ -68,14 +72,13 @@ class Scene:
         self._count = count
         #: The joints that the servos drive.
         self.chain: list[int] = [self._links[name] for name in DRIVEN]
-        self._arm = vehicle.arm
+        self._arm, self._gears = vehicle.arm, gears(vehicle)
         plane = bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=self.client)
         self.ground: int = bullet.createMultiBody(0.0, plane, physicsClientId=self.client)
         self.pipe = -1
         self.holds_sleeve = True
         self.sleeve = -1
-        self._sliding = False
-        self._contact: tuple[float, ...] = ()
+        self._contact = (0.0, 0.0, 0.0)
 
     def close(self) -> None:
         """Give the client back."""
@@ -109,7 +112,7 @@ class Scene:
         bullet.setJointMotorControlArray(
             body, joints, bullet.VELOCITY_CONTROL, forces=[0.0] * self._count, physicsClientId=client
         )
-        for name, sign, other in GEARS:
+        for name, sign, other in self._gears:
             none = (0.0, 0.0, 0.0)
             gear = bullet.createConstraint(
                 body, links[name], body, links[other], bullet.JOINT_GEAR, (0.0, 1.0, 0.0), none, none,
@@ -134,7 +137,7 @@ class Scene:
             physicsClientId=client,
         )
         contact = params.contact
-        self._contact = (contact.stiffness, contact.damping, contact.friction_static, contact.friction_kinetic)
+        self._contact = (contact.stiffness, contact.damping, contact.friction_static)
 
     def put_pipe(self, position: Vec3, heading: float, radius: float, length: float) -> None:
         """Lay the pipe: the middle of its axis (m), the heading it is square to (rad), radius and length (m)."""
@@ -151,8 +154,7 @@ class Scene:
         for link in range(-1, self._count):
             touches = link == self._links["tool"]
             bullet.setCollisionFilterPair(self.vehicle, self.pipe, link, -1, int(touches), physicsClientId=client)
-        if self._contact:
-            self._put_contact()
+        self._put_contact()
 
     def _across(self, heading: float) -> tuple[float, float, float, float]:
         """Takes the z axis to the left of a heading."""
@@ -161,13 +163,13 @@ class Scene:
 
     def _put_contact(self) -> None:
         """Stiffness, damping and friction of the pipe; of it alone, since two bodies' stiffnesses are in series."""
-        stiffness, damping, static, kinetic = self._contact
+        stiffness, damping, friction = self._contact
         self.bullet.changeDynamics(
             self.pipe,
             -1,
             contactStiffness=stiffness,
             contactDamping=damping,
-            lateralFriction=kinetic if self._sliding else static,
+            lateralFriction=friction,
             restitution=0.0,
             physicsClientId=self.client,
         )
@@ -179,15 +181,13 @@ class Scene:
         place = p[at.PIPE_POINT : at.PIPE_POINT + 3]
         turn = bullet.getBasePositionAndOrientation(self.pipe, client)[1]
         bullet.resetBasePositionAndOrientation(self.pipe, place, turn, physicsClientId=client)
-        self._contact = (
-            p[at.CONTACT_STIFFNESS], p[at.CONTACT_DAMPING], p[at.CONTACT_STATIC], p[at.CONTACT_KINETIC]
-        )  # fmt: skip
+        self._contact = (p[at.CONTACT_STIFFNESS], p[at.CONTACT_DAMPING], p[at.CONTACT_STATIC])
         self._put_contact()
 
-    def set_sliding(self, sliding: bool) -> None:
-        """Have the pipe's friction be dynamic or static."""
-        if sliding is not self._sliding:
-            self._sliding = sliding
+    def set_friction(self, friction: float) -> None:
+        """Set the pipe's coefficient of friction."""
+        if friction != self._contact[2]:
+            self._contact = (*self._contact[:2], friction)
             self._put_contact()
 
     def velocity_of_tip(self) -> Vec3:
@@ -214,16 +214,26 @@ class Scene:
     ) -> None:
         """Put the vehicle: position (m), attitude (x, y, z, w), absolute link angles (rad) and their rates (rad/s)."""
         bullet, client, body = self.bullet, self.client, self.vehicle
-        bullet.resetBasePositionAndOrientation(body, position, attitude, physicsClientId=client)
+        middle, _ = bullet.multiplyTransforms(position, attitude, self.centre, (0.0, 0.0, 0.0, 1.0))
+        bullet.resetBasePositionAndOrientation(body, middle, attitude, physicsClientId=client)
         chain = {
             name: (angles[k] - (angles[k - 1] if k else 0.0), rates[k] - (rates[k - 1] if k else 0.0))
             for k, name in enumerate(DRIVEN)
         }
         states = dict(chain)
-        for name, sign, other in GEARS:
+        for name, sign, other in self._gears:
             states[name] = (sign * chain[other][0], sign * chain[other][1])
         for name, (angle, turn) in states.items():
             bullet.resetJointState(body, self._links[name], angle, turn, physicsClientId=client)
+
+    def move_vehicle(self, velocity: Sequence[float], rate: Sequence[float]) -> None:
+        """Set velocity (m/s) and rate (rad/s) of the vehicle where it is, both in W."""
+        _, attitude = self.bullet.getBasePositionAndOrientation(self.vehicle, self.client)
+        none = (0.0, 0.0, 0.0)
+        (x, y, z), _ = self.bullet.multiplyTransforms(none, attitude, self.centre, (0.0, 0.0, 0.0, 1.0))
+        wx, wy, wz = rate
+        there = (velocity[0] + wy * z - wz * y, velocity[1] + wz * x - wx * z, velocity[2] + wx * y - wy * x)
+        self.bullet.resetBaseVelocity(self.vehicle, there, rate, physicsClientId=self.client)
 
     def place_bars(self, angles: Sequence[float]) -> None:
         """Turn the bars that are there to look at, for absolute link angles (rad)."""

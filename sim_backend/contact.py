@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import atan2, sin, sqrt
 from typing import Annotated
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sim_backend import layout as at
 from sim_backend.compiled import compiled
+from sim_backend.deviations import WAVES
 from sim_backend.knob import knob
 
 Array = NDArray[np.float64]
@@ -21,6 +22,9 @@ FRAME_POINTS = 8
 
 #: Modes of a bristle.
 FREE, STICK, SLIDE = 0.0, 1.0, 2.0
+
+#: Least factor on the friction coefficients where the pipe is uneven.
+SLIPPERIEST = 0.2
 
 #: A contact slower than this does not slide, m/s.
 STANDSTILL = 1e-9
@@ -40,6 +44,12 @@ class ContactParams(Struct, frozen=True, forbid_unknown_fields=True):
     friction_kinetic: Annotated[float, knob("1", "dynamic friction coefficient", 0.0, 3.0)] = 0.9
     tangential_stiffness: Annotated[float, knob("N/m", "stiffness of the sticking contact", 1e2, 1e6)] = 20e3
     tangential_damping: Annotated[float, knob("N s/m", "damping of the sticking contact", 0.0, 1e3)] = 40.0
+    unevenness: Annotated[
+        float, knob("1", "standard deviation of both friction coefficients along and round the pipe", 0.0, 0.5)
+    ] = 0.0
+    patch: Annotated[
+        float, knob("m", "wavelength of their unevenness; each wave has half of it to double", 0.005, 1.0)
+    ] = 0.05
     release_angle: Annotated[float, knob("rad", "gripper angle beyond which the sleeve is let go", 0.05, 3.0)] = 0.8
 
     def __post_init__(self) -> None:
@@ -110,6 +120,19 @@ def friction(
 
 
 @compiled()
+def grip(p: Array, ahead: float, up: float, along: float) -> float:
+    """Factor on both friction coefficients at a place on the pipe: from its axis (ahead, up), and along it, m."""
+    if p[at.UNEVENNESS] == 0.0:
+        return 1.0
+    round_the_pipe = p[at.PIPE_RADIUS] * atan2(up, -ahead)
+    waves = 0.0
+    for i in range(WAVES):
+        row = at.WAVE + 3 * i
+        waves += sin(p[row] * along + p[row + 1] * round_the_pipe + p[row + 2])
+    return float(max(SLIPPERIEST, 1.0 + p[at.UNEVENNESS] * waves * sqrt(2.0 / WAVES)))
+
+
+@compiled()
 def pipe_contact(x: Array, p: Array, tip: Three, velocity: Three) -> Three:
     """Force of the pipe on the gripper's tip, N, W; updates the bristle, the slip and the contact figures in ``x``.
 
@@ -139,6 +162,7 @@ def pipe_contact(x: Array, p: Array, tip: Three, velocity: Three) -> Three:
     round_speed = vu * ea - va * eu
     axial_speed = velocity[1] * nx - velocity[0] * ny
     normal = max(0.0, p[at.CONTACT_STIFFNESS] * penetration - p[at.CONTACT_DAMPING] * outward)
+    share = grip(p, ahead, up, ry * nx - rx * ny)
     f_round, f_axial, mode, z1, z2, slid = friction(
         x[at.CONTACT_MODE],
         x[at.CONTACT_STRETCH],
@@ -149,8 +173,8 @@ def pipe_contact(x: Array, p: Array, tip: Three, velocity: Three) -> Three:
         p[at.STEP],
         p[at.CONTACT_TANGENTIAL_STIFFNESS],
         p[at.CONTACT_TANGENTIAL_DAMPING],
-        p[at.CONTACT_STATIC],
-        p[at.CONTACT_KINETIC],
+        share * p[at.CONTACT_STATIC],
+        share * p[at.CONTACT_KINETIC],
     )
     x[at.CONTACT_MODE] = mode
     x[at.CONTACT_STRETCH] = z1

@@ -29,12 +29,19 @@ Three = tuple[float, float, float]
 _CARRIERS = (Carrier.LINK_1, Carrier.LINK_2, Carrier.TOOL)
 
 
-def lump(vehicle: Vehicle, parts: Iterable[Part], rotor_inertia: float) -> Array:
-    """The sums over base and parts, shape (38,), in the order of the ``L_`` indices of ``layout``."""
+def lump(vehicle: Vehicle, parts: Iterable[Part], rotor_inertia: float, centre: Three = (0.0, 0.0, 0.0)) -> Array:
+    """The sums over base and parts, shape (38,), in the order of the ``L_`` indices of ``layout``.
+
+    ``centre`` is the base's centre of mass (m, B), about which its inertia is.
+    """
     out = np.zeros(at.LUMPED_SIZE)
     first, first_u, cross, pair = np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     inertia, turning = np.diag(np.array(vehicle.base.inertia)), np.zeros((3, 3))
     out[at.L_MASS] = vehicle.base.mass
+    if any(centre):
+        c = np.array(centre)
+        first += vehicle.base.mass * c
+        inertia += vehicle.base.mass * (c @ c * np.eye(3) - np.outer(c, c))
     for part in parts:
         o = np.array(vehicle.arm.mount) + np.array([part.offset[0], 0.0, part.offset[1]])
         a = np.array(part.along)

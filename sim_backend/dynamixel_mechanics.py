@@ -63,8 +63,8 @@ class WorldServos:
         self._random = Random(seed)
         sensors = world.params.sensors
         self._temperature = sensors.servos.temperature
-        self._velocity_noise = 0.0 if sensors.ideal else sensors.servos.velocity_noise
-        self._current_noise = 0.0 if sensors.ideal else sensors.servos.current_noise
+        self._velocity_noise = sensors.servos.velocity_noise
+        self._current_noise = sensors.servos.current_noise
 
     def exchange(self, now: float, drives: list[Drive]) -> list[Motion]:
         """Command the world when something has changed; look at its newest snapshot."""

@@ -31,6 +31,9 @@ GEARS = (
     ("wrist_plate", -1.0, "link_1"),
     ("crank_turn", 1.0, "link_1"),
     ("crank", 1.0, "link_2"),
+)
+#: The same for the halves of the motors that turn the other way.
+WHEELS = (
     ("wheel_1", -1.0, "link_1"),
     ("wheel_2", -1.0, "link_2"),
     ("wheel_3", -1.0, "tool"),
@@ -39,8 +42,8 @@ GEARS = (
 SHOULDER, SLEEVE = "shoulder", "sleeve"
 #: Mass of what only turns between two others, taken from its neighbour, kg.
 TOKEN_MASS = 1e-4
-#: Its inertia as a share of the motor's, taken from link 1, with which it turns. Less is slower to iterate.
-TOKEN_SHARE = 0.02
+#: Its inertia as a share of that of link 1, with which it turns, and from which it is taken. Less is slower to iterate.
+TOKEN_SHARE = 0.45
 
 _LINK_OF = {Carrier.LINK_1: "link_1", Carrier.LINK_2: "link_2", Carrier.TOOL: "tool"}
 _EPSILON = 1e-9
@@ -95,22 +98,31 @@ def inertial(body: Body) -> Inertial:
     return Inertial(body.mass, (x, 0.0, z), -a, (mean + spread, yy, mean - spread))
 
 
+def gears(vehicle: Vehicle) -> tuple[tuple[str, float, str], ...]:
+    """The gears that this vehicle needs: without inertia of its motors there are no wheels."""
+    return (*GEARS, *WHEELS) if vehicle.servo.rotor_inertia > 0.0 else GEARS
+
+
 def bodies(vehicle: Vehicle) -> dict[str, Body]:
     """All links but the sleeve, by name. Raises ValueError for a part that is none of this parallelogram."""
     base, rotor = vehicle.base, vehicle.servo.rotor_inertia
-    out = {name: Body() for name in ("base", SHOULDER, *DRIVEN, *(name for name, _, _ in GEARS))}
+    out = {name: Body() for name in ("base", SHOULDER, *DRIVEN, *(name for name, _, _ in gears(vehicle)))}
     for part in vehicle.arm.parts:
         _lump(vehicle, part, out)
-    token, half = TOKEN_SHARE * rotor, 0.5 * rotor
+    half = 0.5 * rotor
+    wheels = [name for name, _, _ in WHEELS if name in out]
+    for name, wheel in zip(DRIVEN, wheels, strict=False):
+        out[name].add(0.0, own=(half, half, half))
+        out[wheel].add(TOKEN_MASS, own=(half, half, half))
+    xx, yy, zz = inertial(out["link_1"]).moments
     for turn, neighbour in (("wrist_turn", "wrist_plate"), ("crank_turn", "crank")):
-        out[turn].add(TOKEN_MASS, own=(token, token, token))
+        out[turn].add(TOKEN_MASS, own=(TOKEN_SHARE * xx, TOKEN_SHARE * yy, TOKEN_SHARE * zz))
         out[neighbour].add(-TOKEN_MASS)
-    for k, name in enumerate(DRIVEN):
-        own = half - 2.0 * token if k == 0 else half
-        out[name].add(0.0, own=(own, own, own))
-        out[f"wheel_{k + 1}"].add(TOKEN_MASS, own=(half, half, half))
+    less = -2.0 * TOKEN_SHARE
+    out["link_1"].add(0.0, own=(less * xx, less * yy, less * zz))
     x, y, z = base.inertia
-    out["base"].add(base.mass - 3.0 * TOKEN_MASS, own=(x - 3.0 * rotor, y - 3.0 * rotor, z - 3.0 * rotor))
+    mass = base.mass - len(wheels) * TOKEN_MASS
+    out["base"].add(mass, own=(x - 3.0 * rotor, y - 3.0 * rotor, z - 3.0 * rotor))
     return out
 
 

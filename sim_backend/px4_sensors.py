@@ -19,12 +19,12 @@ from drivers.rotation import inverse, rotate
 from drivers.samples import Quat, Vec3
 from sim_backend import layout as at
 from sim_backend.knob import knob
-from sim_backend.sensors import SensorParams, Snapshot, imu_errors
+from sim_backend.sensors import Imu, SensorParams, Snapshot
 
 _ACCEL_AND_GYRO, _MAGNETOMETER, _BAROMETER = 0x3F, 0x1C0, 0x1A00  # HIL_SENSOR.fields_updated
 _MAGNETOMETER_EVERY, _BAROMETER_EVERY, _GPS_EVERY = 3, 5, 50  # samples of the inertial sensors
 _METRES_PER_DEGREE = 111_319.5
-_NOISE = 6 + 3 + 1 + 6
+_NOISE = Imu.NOISES + 3 + 1 + 6
 
 
 class Px4SensorParams(Struct, frozen=True, forbid_unknown_fields=True):
@@ -46,45 +46,44 @@ class Px4Sensors:
     """Makes the messages. Deterministic: same seed and snapshots, same numbers. ``gps``: there is a receiver."""
 
     def __init__(
-        self, inertial: SensorParams, params: Px4SensorParams | None = None, gps: bool = False, seed: int = 0
+        self,
+        inertial: SensorParams,
+        hover: float,
+        params: Px4SensorParams | None = None,
+        gps: bool = False,
+        seed: int = 0,
     ) -> None:
-        self._inertial = inertial.autopilot
+        """``hover``: thrust of one rotor in hover, N."""
         self._params = params or Px4SensorParams()
         self._gps = gps
-        self._exact = inertial.ideal
         # Not the random numbers of the world's own sensors, which start from the same seed.
         self._random = np.random.default_rng([seed, 4560])
-        start = self._random.standard_normal(6)
-        self._gyro_bias = _three(start[0:3] * self._inertial.gyro_bias)
-        self._accelerometer_bias = _three(start[3:6] * self._inertial.accelerometer_bias)
+        self._imu = Imu(inertial.autopilot, hover, self._random)
         self._taken = 0
 
     def measure(self, now: Snapshot) -> list[Any]:
         """The messages of one sample of the inertial sensors, 250 a second; GPS comes every 50th time."""
         noise = self._random.standard_normal(_NOISE)
-        messages = [self._sensor(now, noise[:10])]
+        messages = [self._sensor(now, noise[: Imu.NOISES + 4])]
         if self._gps and self._taken % _GPS_EVERY == 0:
-            messages.append(self._position(now, noise[10:]))
+            messages.append(self._position(now, noise[Imu.NOISES + 4 :]))
         self._taken += 1
         return messages
 
     def _sensor(self, now: Snapshot, noise: np.ndarray[Any, np.dtype[np.float64]]) -> Any:
         params, x = self._params, now.x
         q: Quat = (x[at.ATTITUDE], x[at.ATTITUDE + 1], x[at.ATTITUDE + 2], x[at.ATTITUDE + 3])
-        rate, force = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        if not self._exact:
-            rate, force = imu_errors(
-                self._inertial, self._gyro_bias, self._accelerometer_bias, noise[0:6].tolist(), now
-            )
+        rate, force = self._imu.errors(noise[: Imu.NOISES].tolist(), now)
+        noise = noise[Imu.NOISES :]
         w, f = at.RATE, at.SPECIFIC_FORCE_SUM
         gyro = px4_from_body((x[w] + rate[0], x[w + 1] + rate[1], x[w + 2] + rate[2]))
         accel = px4_from_body(
             (x[f] / now.steps + force[0], x[f + 1] / now.steps + force[1], x[f + 2] / now.steps + force[2])
         )
         field = px4_from_body(rotate(inverse(q), (0.0, params.field_north, -params.field_down)))
-        shaken = params.magnetometer_noise * noise[6:9]
+        shaken = params.magnetometer_noise * noise[0:3]
         altitude = params.altitude + x[at.POSITION + 2]
-        pressure = pressure_at(altitude) + params.barometer_noise * float(noise[9])
+        pressure = pressure_at(altitude) + params.barometer_noise * float(noise[3])
         updated = _ACCEL_AND_GYRO
         updated |= _MAGNETOMETER if self._taken % _MAGNETOMETER_EVERY == 0 else 0
         updated |= _BAROMETER if self._taken % _BAROMETER_EVERY == 0 else 0

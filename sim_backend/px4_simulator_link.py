@@ -33,7 +33,7 @@ from sim_backend.motors import rated_voltage
 from sim_backend.pace import Crier, Pace
 from sim_backend.px4_sensors import Px4SensorParams, Px4Sensors
 from sim_backend.px4_wire import LostError, wire_of
-from sim_backend.sensors import SensorParams
+from sim_backend.sensors import REALISTIC, SensorParams, hover_thrust
 from sim_backend.world import World, WorldParams
 
 _SIMULATOR = (1, 200)  # MAVLink system and component
@@ -70,7 +70,7 @@ class Px4SimulatorLink:
         #: Answers that the world waited for in vain.
         self.unanswered = 0
         self._told = Notices()
-        self._sensors = Px4Sensors(world.params.sensors, params.sensors, params.gps, seed)
+        self._sensors = Px4Sensors(world.params.sensors, hover_thrust(world.vehicle), params.sensors, params.gps, seed)
         self._mav = mavlink.MAVLink(None, srcSystem=_SIMULATOR[0], srcComponent=_SIMULATOR[1])
         self._full = world.vehicle.rotors.max_thrust
         self._curve = world.vehicle.rotors.curve
@@ -274,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     world = World(
         vehicle,
-        WorldParams(plant=PlantParams(ideal_motors=False), sensors=SensorParams(ideal=given.exact)),
+        WorldParams(plant=PlantParams(ideal_motors=False), sensors=SensorParams() if given.exact else REALISTIC),
         seed=given.seed,
     )
     try:

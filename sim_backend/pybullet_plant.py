@@ -12,25 +12,28 @@ from math import hypot
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.airframe import airframe
 from sim_backend.array_plant import ArrayPlant, PlantParams
 from sim_backend.bullet_scene import NoBulletError, Scene
 from sim_backend.compiled import compiled
-from sim_backend.contact import FREE, SLIDE, STICK
+from sim_backend.contact import FREE, SLIDE, STICK, grip
+from sim_backend.deviations import AS_MODELLED, Deviations
 from sim_backend.inner_loops import inner_loops
-from sim_backend.motors import battery, rotors
-from sim_backend.rigid_body import drag, let_go, rotation, tips, watch
+from sim_backend.motors import battery
+from sim_backend.rigid_body import let_go, rotation, tips, watch
 from sim_backend.servos import joint_torque, stop_torque, tool_servos
 
 Array = NDArray[np.float64]
 
 # What ``_drive`` tells for one step: force and moment on the base (W), torques on the joints of the chain (the sums of
-# what acts on the links beyond), where the base is, and whether pipe or ground are near.
-_FORCE, _MOMENT, _TORQUE, _PLACE, _NEAR_PIPE, _NEAR_GROUND, _DRIVE_SIZE = 0, 3, 6, 9, 12, 13, 14
+# what acts on the links beyond), where the base is, whether pipe or ground are near, and how the pipe grips there.
+_FORCE, _MOMENT, _TORQUE, _PLACE, _NEAR_PIPE, _NEAR_GROUND, _GRIP, _DRIVE_SIZE = 0, 3, 6, 9, 12, 13, 14, 15
 # What Bullet tells after it: place, attitude (x, y, z, w), velocity, rate (W), angles and rates of the chain's joints.
 _MOVED_SIZE = 19
 
@@ -50,13 +53,9 @@ def _drive(x: Array, p: Array, u: Array, out: Array, loops: bool) -> None:
         if x[at.PHASE] >= p[at.LOOP_STEPS]:
             x[at.PHASE] = 0.0
     battery(x, p, p[at.STEP])
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation(x)
-    vx = x[at.VELOCITY]
-    vy = x[at.VELOCITY + 1]
-    vz = x[at.VELOCITY + 2]
-    thrust, mx, my, mz = rotors(x, p, u)
-    fx, fy, fz = drag(p, xx * vx + yx * vy + zx * vz, xy * vx + yy * vy + zy * vz, xz * vx + yz * vy + zz * vz)
-    fz = thrust + fz
+    turn = rotation(x)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = turn
+    fx, fy, fz, mx, my, mz = airframe(x, p, u, turn, x[at.VELOCITY], x[at.VELOCITY + 1], x[at.VELOCITY + 2])
     out[_FORCE] = xx * fx + xy * fy + xz * fz
     out[_FORCE + 1] = yx * fx + yy * fy + yz * fz
     out[_FORCE + 2] = zx * fx + zy * fy + zz * fz
@@ -76,25 +75,39 @@ def _drive(x: Array, p: Array, u: Array, out: Array, loops: bool) -> None:
     for i in range(3):
         out[_PLACE + i] = x[at.POSITION + i]
     tips(x, p)
-    ahead = (x[at.TIP] - p[at.PIPE_POINT]) * p[at.PIPE_NORMAL] + (x[at.TIP + 1] - p[at.PIPE_POINT + 1]) * p[
-        at.PIPE_NORMAL + 1
-    ]
-    gap = hypot(ahead, x[at.TIP + 2] - p[at.PIPE_POINT + 2]) - p[at.PIPE_RADIUS]
-    out[_NEAR_PIPE] = 1.0 if gap < _NEAR else 0.0
+    nx = p[at.PIPE_NORMAL]
+    ny = p[at.PIPE_NORMAL + 1]
+    rx = x[at.TIP] - p[at.PIPE_POINT]
+    ry = x[at.TIP + 1] - p[at.PIPE_POINT + 1]
+    ahead = rx * nx + ry * ny
+    up = x[at.TIP + 2] - p[at.PIPE_POINT + 2]
+    near = hypot(ahead, up) - p[at.PIPE_RADIUS] < _NEAR
+    out[_NEAR_PIPE] = 1.0 if near else 0.0
+    out[_GRIP] = grip(p, ahead, up, ry * nx - rx * ny) if near else 1.0
     out[_NEAR_GROUND] = 1.0 if x[at.POSITION + 2] < p[at.GROUND_REACH] + _NEAR else 0.0
 
 
-@compiled("(f8[::1], f8[::1], f8[::1])")
-def _take(x: Array, p: Array, moved: Array) -> None:
-    """Write into ``x`` what Bullet has moved in one step."""
+@compiled("(f8[::1], f8[::1], f8[::1], f8[::1])")
+def _take(x: Array, p: Array, moved: Array, centre: Array) -> None:
+    """Write into ``x`` what Bullet has moved in one step; ``centre`` is where it has the base, m, B."""
     share = 1.0 / p[at.STEP]
-    for i in range(3):
-        x[at.POSITION + i] = moved[i]
-        x[at.ACCELERATION + i] = (moved[7 + i] - x[at.VELOCITY + i]) * share
-        x[at.VELOCITY + i] = moved[7 + i]
-        x[at.ATTITUDE + 1 + i] = moved[3 + i]
     x[at.ATTITUDE] = moved[6]
+    for i in range(3):
+        x[at.ATTITUDE + 1 + i] = moved[3 + i]
     xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation(x)
+    cx = xx * centre[0] + xy * centre[1] + xz * centre[2]
+    cy = yx * centre[0] + yy * centre[1] + yz * centre[2]
+    cz = zx * centre[0] + zy * centre[1] + zz * centre[2]
+    x[at.POSITION] = moved[0] - cx
+    x[at.POSITION + 1] = moved[1] - cy
+    x[at.POSITION + 2] = moved[2] - cz
+    vx = moved[7] - (moved[11] * cz - moved[12] * cy)
+    vy = moved[8] - (moved[12] * cx - moved[10] * cz)
+    vz = moved[9] - (moved[10] * cy - moved[11] * cx)
+    for i in range(3):
+        speed = vx if i == 0 else (vy if i == 1 else vz)
+        x[at.ACCELERATION + i] = (speed - x[at.VELOCITY + i]) * share
+        x[at.VELOCITY + i] = speed
     ax = x[at.ACCELERATION]
     ay = x[at.ACCELERATION + 1]
     az = x[at.ACCELERATION + 2] + p[at.GRAVITY]
@@ -141,16 +154,20 @@ class PyBulletPlant(ArrayPlant):
         pipe_heading: float,
         pipe_radius: float,
         pipe_length: float = 2.0,
+        truth: Deviations = AS_MODELLED,
     ) -> None:
-        super().__init__(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length)
+        super().__init__(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
+        centre, real = truth.base_centre(vehicle), truth.vehicle(vehicle)
+        servo = replace(real.servo, rotor_inertia=params.rotor_inertia(real))
         try:
-            self.scene = scene = Scene(vehicle, window=params.bullet.window)
+            self.scene = scene = Scene(replace(real, servo=servo), window=params.bullet.window, centre=centre)
         except NoBulletError as error:
             raise ValueError(f"world.plant.kind = pybullet: {error}; or choose rigid") from error
         self._finalizer = weakref.finalize(self, scene.close)
         self._bullet: Any = scene.bullet
         scene.prepare(params, self.step)
-        scene.put_pipe(pipe_position, pipe_heading, pipe_radius, pipe_length)
+        scene.put_pipe(*truth.pipe_pose(pipe_position, pipe_heading), pipe_radius, pipe_length)
+        self._centre = np.array(centre)
         self._out = np.zeros(_DRIVE_SIZE)
         self._moved = np.zeros(_MOVED_SIZE)
         self._known_x = np.zeros(at.ACCELERATION)
@@ -179,9 +196,9 @@ class PyBulletPlant(ArrayPlant):
         for _ in range(steps):
             _drive(x, p, u, out, loops)
             told = out.tolist()
-            push(body, -1, told[0:3], told[9:12], world, client)
-            twist(body, -1, told[3:6], world, client)
-            turn(body, chain, torque, forces=told[6:9], physicsClientId=client)
+            push(body, -1, told[_FORCE:_MOMENT], told[_PLACE:_NEAR_PIPE], world, client)
+            twist(body, -1, told[_MOMENT:_TORQUE], world, client)
+            turn(body, chain, torque, forces=told[_TORQUE:_PLACE], physicsClientId=client)
             bullet.stepSimulation(client)
             place, attitude = place_of(body, client)
             velocity, rate = velocity_of(body, client)
@@ -189,9 +206,9 @@ class PyBulletPlant(ArrayPlant):
             moved[:] = (*place, *attitude, *velocity, *rate, a[0], b[0], c[0], a[1], b[1], c[1])
             near_ground = told[_NEAR_GROUND] != 0.0
             before = x[at.VELOCITY : at.RATE + 3].tolist() if near_ground else None
-            _take(x, p, moved)
+            _take(x, p, moved, self._centre)
             if told[_NEAR_PIPE] != 0.0 or x[at.CONTACT_FORCE] != 0.0:
-                self._feel_pipe()
+                self._feel_pipe(told[_GRIP])
             if x[at.PAYLOAD] != 0.0 and x[at.GRIPPER] > p[at.RELEASE_ANGLE]:
                 _let_go(x, p)
                 self._release()
@@ -220,15 +237,16 @@ class PyBulletPlant(ArrayPlant):
         turning = [sum(m[3 * row + n] * rate[n] for n in range(3)) for row in range(3)]
         angles, rates = x[at.JOINT : at.JOINT + 3], x[at.JOINT_RATE : at.JOINT_RATE + 3]
         self.scene.place_vehicle(x[at.POSITION : at.POSITION + 3], (i, j, k, w), angles, rates)
-        self._bullet.resetBaseVelocity(
-            self.scene.vehicle, x[at.VELOCITY : at.VELOCITY + 3], turning, physicsClientId=self.scene.client
-        )
+        self.scene.move_vehicle(x[at.VELOCITY : at.VELOCITY + 3], turning)
 
     def _release(self) -> None:
         self.scene.release_sleeve(on_pipe=self.x[at.SLEEVE_ON_PIPE] != 0.0)
 
-    def _feel_pipe(self) -> None:
-        """Take force and slip of the tip on the pipe from Bullet, and choose between static and dynamic friction."""
+    def _feel_pipe(self, grip: float) -> None:
+        """Take force and slip of the tip on the pipe from Bullet, and choose between static and dynamic friction.
+
+        ``grip`` is the factor on both at this place of the pipe.
+        """
         x, p, scene = self.x, self.p, self.scene
         normal = 0.0
         sum_x = sum_y = sum_z = 0.0
@@ -245,7 +263,7 @@ class PyBulletPlant(ArrayPlant):
         x[at.CONTACT_VECTOR : at.CONTACT_VECTOR + 3] = (sum_x, sum_y, sum_z)
         if normal == 0.0:
             x[at.CONTACT_MODE] = FREE
-            scene.set_sliding(False)
+            scene.set_friction(grip * p[at.CONTACT_STATIC])
             return
         if normal > x[at.CONTACT_PEAK]:
             x[at.CONTACT_PEAK] = normal
@@ -254,12 +272,12 @@ class PyBulletPlant(ArrayPlant):
         speed = hypot(vx - through * nx, vy - through * ny, vz - through * nz)
         rub = hypot(sum_x - normal * nx, sum_y - normal * ny, sum_z - normal * nz)
         sliding = x[at.CONTACT_MODE] == SLIDE
-        limit = p[at.CONTACT_KINETIC] if sliding else p[at.CONTACT_STATIC]
+        limit = grip * (p[at.CONTACT_KINETIC] if sliding else p[at.CONTACT_STATIC])
         sliding = bool(rub >= 0.999 * limit * normal and speed > _CREEP)
         x[at.CONTACT_MODE] = SLIDE if sliding else STICK
         if sliding:
             x[at.TIP_SLIP] += speed * p[at.STEP]
-        scene.set_sliding(sliding)
+        scene.set_friction(grip * p[at.CONTACT_KINETIC if sliding else at.CONTACT_STATIC])
 
     def _feel_ground(self, before: list[float]) -> None:
         """Note whether anything touches the ground, and whether the airframe has hit it too hard.

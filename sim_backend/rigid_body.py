@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.airframe import airframe
 from sim_backend.array_plant import ArrayPlant, PlantParams
 from sim_backend.compiled import compiled
 from sim_backend.contact import ground_point, pipe_contact
+from sim_backend.deviations import AS_MODELLED, Deviations
 from sim_backend.dynamics import accelerations
 from sim_backend.inner_loops import inner_loops
-from sim_backend.motors import battery, rotors
+from sim_backend.motors import Nine, battery
 from sim_backend.servos import joint_torque, stop_torque, tool_servos
 
 Array = NDArray[np.float64]
@@ -53,7 +55,7 @@ def drift(x: Array, step: float) -> None:
 
 
 @compiled()
-def rotation(x: Array) -> tuple[float, float, float, float, float, float, float, float, float]:
+def rotation(x: Array) -> Nine:
     """The rotation from B to W, row by row."""
     w = x[at.ATTITUDE]
     i = x[at.ATTITUDE + 1]
@@ -70,12 +72,6 @@ def rotation(x: Array) -> tuple[float, float, float, float, float, float, float,
         2.0 * (j * k + w * i),
         1.0 - 2.0 * (i * i + j * j),
     )
-
-
-@compiled()
-def drag(p: Array, vx: float, vy: float, vz: float) -> Three:
-    """Linear drag, N, B, at the velocity v in B, m/s."""
-    return -p[at.DRAG] * vx, -p[at.DRAG + 1] * vy, -p[at.DRAG + 2] * vz
 
 
 @compiled()
@@ -111,10 +107,8 @@ def _kick(x: Array, p: Array, u: Array) -> None:
     c3 = cos(a3)
     s3 = sin(a3)
 
-    # Rotors and drag.
-    thrust, mx, my, mz = rotors(x, p, u)
-    fx, fy, fz = drag(p, xx * vx + yx * vy + zx * vz, xy * vx + yy * vy + zy * vz, xz * vx + yz * vy + zz * vz)
-    fz = thrust + fz
+    # Rotors, drag and surfaces.
+    fx, fy, fz, mx, my, mz = airframe(x, p, u, (xx, xy, xz, yx, yy, yz, zx, zy, zz), vx, vy, vz)
 
     # Servos and stops.
     tool_servos(x, p, u)
@@ -342,8 +336,9 @@ class RigidBody(ArrayPlant):
         pipe_heading: float,
         pipe_radius: float,
         pipe_length: float = 2.0,
+        truth: Deviations = AS_MODELLED,
     ) -> None:
-        super().__init__(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length)
+        super().__init__(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
         self.stand()
 
     def move(self, steps: int) -> None:

@@ -18,11 +18,14 @@ def joint_torque(x: Array, p: Array, u: Array, k: int, angle: float, rate: float
     The motor gives at most the stall torque, and where it drives, what the torque-speed line leaves. Friction of the
     gear is Coulomb (regularised near standstill) and viscous. The current is the supply's: motor current times
     duty cycle, the duty being what overcomes resistance and back-EMF. An ideal servo has no friction, and shows the
-    motor current, which is proportional to the torque.
+    motor current, which is proportional to the torque. With play in the gear the motor turns by itself between the
+    teeth; the encoder sits at the output.
     """
     stall = float(p[at.STALL_TORQUE])
     ideal = p[at.SERVO_IDEAL] != 0.0
-    speed = rate / p[at.NO_LOAD_SPEED]
+    play = p[at.BACKLASH] > 0.0
+    turning = x[at.MOTOR_RATE + k] if play else rate
+    speed = turning / p[at.NO_LOAD_SPEED]
     motor = 0.0
     if u[at.U_TORQUE_ON] != 0.0 and u[at.U_LIMP + k] == 0.0:
         limit = stall
@@ -37,10 +40,31 @@ def joint_torque(x: Array, p: Array, u: Array, k: int, angle: float, rate: float
     share = motor / stall
     if ideal:
         x[at.SERVO_CURRENT + k] = p[at.STALL_CURRENT] * share
-        return motor
-    x[at.SERVO_CURRENT + k] = p[at.STALL_CURRENT] * share * min(1.0, abs(share + speed))
-    slip = min(max(rate / p[at.FRICTION_SPEED], -1.0), 1.0)
-    return float(motor - p[at.FRICTION_STATIC] * slip - p[at.FRICTION_VISCOUS] * rate)
+    else:
+        x[at.SERVO_CURRENT + k] = p[at.STALL_CURRENT] * share * min(1.0, abs(share + speed))
+        slip = min(max(turning / p[at.FRICTION_SPEED], -1.0), 1.0)
+        motor = float(motor - p[at.FRICTION_STATIC] * slip - p[at.FRICTION_VISCOUS] * turning)
+    return _through_play(x, p, k, motor, rate) if play else motor
+
+
+@compiled()
+def _through_play(x: Array, p: Array, k: int, motor: float, rate: float) -> float:
+    """What reaches the output of a gear with play, N m; moves the motor side on by one step under its torque.
+
+    The motor side has the inertia of the rotor and turns freely within the play; at either end the teeth are a
+    stiff spring-damper that pushes and never pulls. All is seen at the output; ``rate`` is the output's.
+    """
+    step = p[at.STEP]
+    lag = x[at.SERVO_LAG + k] + step * (x[at.MOTOR_RATE + k] - rate)
+    x[at.SERVO_LAG + k] = lag
+    gear = 0.0
+    closing = p[at.GEAR_DAMPING] * (x[at.MOTOR_RATE + k] - rate)
+    if lag > p[at.BACKLASH]:
+        gear = max(0.0, p[at.GEAR_STIFFNESS] * (lag - p[at.BACKLASH]) + closing)
+    elif lag < -p[at.BACKLASH]:
+        gear = min(0.0, p[at.GEAR_STIFFNESS] * (lag + p[at.BACKLASH]) + closing)
+    x[at.MOTOR_RATE + k] += step * (motor - gear) / p[at.MOTOR_INERTIA]
+    return float(gear)
 
 
 @compiled()

@@ -30,20 +30,19 @@ _ORIGIN = (0.0, 0.0, 0.0)
 _WEIGHTLESS = Inertial(1e-9, _ORIGIN, 0.0, (1e-12, 1e-12, 1e-12))
 
 
-def urdf(vehicle: Vehicle, bars: bool = False) -> str:
+def urdf(vehicle: Vehicle, bars: bool = False, centre: Vec3 = _ORIGIN) -> str:
     """The URDF text of the vehicle with the sleeve in the gripper.
 
     The base's frame is B; all link frames are parallel to it while the joint angles, each against the link before, are
-    zero. ``bars`` adds the
-    parallelograms' bars as links to look at; their mass is in the other bodies already. Raises ValueError for an arm
-    that is no such parallelogram.
+    zero. ``bars`` adds the parallelograms' bars as links to look at; their mass is in the other bodies already.
+    ``centre`` is the base's centre of mass, m, B. Raises ValueError for an arm that is no such parallelogram.
     """
     arm, masses = vehicle.arm, bodies(vehicle)
     robot = ET.Element("robot", name="vehicle")
     for name, rgb in _COLOURS.items():
         material = ET.SubElement(robot, "material", name=name)
         ET.SubElement(material, "color", rgba=_text(*rgb, 1.0))
-    _airframe(_link(robot, "base", inertial(masses["base"])), vehicle)
+    _airframe(_link(robot, "base", inertial(masses["base"])._replace(centre=centre)), vehicle)
     if masses[SHOULDER].mass > 0.0:
         _link(robot, SHOULDER, inertial(masses[SHOULDER]))
         _joint(robot, SHOULDER, "base", arm.mount, turning=False)
@@ -62,6 +61,8 @@ def urdf(vehicle: Vehicle, bars: bool = False) -> str:
         ("wheel_2", "wheel_1", _ORIGIN),
         ("wheel_3", "wheel_2", _ORIGIN),
     ):
+        if name not in masses:
+            continue
         link = _link(robot, name, inertial(masses[name]))
         _joint(robot, name, parent, origin)
         if name in ("link_1", "link_2"):

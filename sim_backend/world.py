@@ -13,10 +13,12 @@ from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.array_plant import ArrayPlant, PlantKind, PlantParams, truth_of
 from sim_backend.autopilot import Autopilot, AutopilotParams
+from sim_backend.deviations import AS_MODELLED, DeviationParams, Deviations, deviations
 from sim_backend.inner_loops import LoopParams, put_loops
 from sim_backend.plant import Truth
 from sim_backend.rigid_body import RigidBody
 from sim_backend.sensors import SensorParams, Sensors, Snapshot
+from sim_backend.wind import Wind, WindParams
 
 Array = NDArray[np.float64]
 
@@ -34,6 +36,8 @@ class WorldParams(Struct, frozen=True, forbid_unknown_fields=True):
     loops: LoopParams = LoopParams()
     autopilot: AutopilotParams = AutopilotParams()
     sensors: SensorParams = SensorParams()
+    wind: WindParams = WindParams()
+    deviations: DeviationParams = DeviationParams()
 
 
 def plant_of(
@@ -43,14 +47,15 @@ def plant_of(
     pipe_heading: float,
     pipe_radius: float,
     pipe_length: float,
+    truth: Deviations = AS_MODELLED,
 ) -> ArrayPlant:
     """The plant of the kind that ``params`` asks for; ValueError when this machine cannot have it."""
     if params.kind is PlantKind.RIGID:
-        return RigidBody(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length)
+        return RigidBody(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
     # Imported here since not every machine that flies has PyBullet.
     from sim_backend.pybullet_plant import PyBulletPlant
 
-    return PyBulletPlant(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length)
+    return PyBulletPlant(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
 
 
 class World:
@@ -76,9 +81,12 @@ class World:
     ) -> None:
         self.vehicle = vehicle
         self.params = params = params or WorldParams()
-        self.plant = plant_of(vehicle, params.plant, pipe_position, pipe_heading, pipe_radius, pipe_length)
+        #: How the true vehicle and pipe differ from ``vehicle`` and the pipe that was asked for.
+        self.deviations = truth = deviations(params.deviations, seed)
+        self.plant = plant_of(vehicle, params.plant, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
         put_loops(self.plant.p, vehicle, params.loops, self.plant.step)
-        self.autopilot = Autopilot(params.autopilot)
+        self.autopilot = Autopilot(params.autopilot, seed)
+        self.wind = Wind(params.wind, seed)
         self.sensors = Sensors(params.sensors, vehicle, seed)
         self._servo_command: tuple[ServoCommand, Limp] | None = None
         self.snapshot = self._look(self.plant.x.tolist(), self.plant.last_steps)
@@ -127,6 +135,8 @@ class World:
         while left:
             t = plant.time
             self.autopilot.update(t, state, u)
+            if self.wind.blows:
+                u[at.U_WIND : at.U_WIND + 3] = self.wind.until(round(t * 1e9))
             until = (self.autopilot.next_change() - t) / step
             count = min(left, longest)
             if until < count:

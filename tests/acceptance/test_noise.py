@@ -6,8 +6,9 @@ import pytest
 
 from onboard.replay import replay
 from tests.acceptance.flights import SHORT, Flown, Hangar, completed
+from tests.sim_backend.noisy import NOISY_SET
 
-NOISY = (*SHORT, "interface=attitude", "world.sensors.ideal=false")
+NOISY = (*SHORT, "interface=attitude", NOISY_SET)
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0, 1 when the flight in real time failed, or 2 for a wrong input."""
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
     parser.add_argument("--json", type=Path, default=Path("build/bench.json"), help="where to write the figures")
+    parser.add_argument("--scenario", default="paper", metavar="NAME|FILE", help="what is flown")
     parser.add_argument("--law", help="parameter set of the controllers")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="set a parameter")
     parser.add_argument("--longest", type=float, metavar="S", help="break the mission off after S simulated seconds")
@@ -35,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.longest is not None and not 1.0 <= given.longest <= 900.0:
         parser.error(f"--longest {given.longest:g}: from 1 to 900 s")
     try:
-        config = load_config(law=given.law, sets=given.set)
+        config = load_config(given.scenario, given.law, given.set)
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.open("ab").close()
     except ConfigError as error:

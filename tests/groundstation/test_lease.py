@@ -8,27 +8,17 @@ import pty
 import select
 import signal
 import subprocess
-from collections.abc import Iterator
 
 import pytest
 
-from groundstation import codes, station
+from groundstation import codes
 from groundstation.client import Client, StationSettings
 from onboard.core.types import Phase
 from onboard.wire import TakeLease
-from tests.groundstation.craft import Craft, command, craft, keeper
+from tests.groundstation.craft import Craft, command, keeper
 from tests.waiting import LONG, seconds_until
 
 Told = pytest.CaptureFixture[str]
-
-
-@pytest.fixture
-def vehicle(monkeypatch: pytest.MonkeyPatch) -> Iterator[Craft]:
-    with craft() as flying:
-        monkeypatch.setenv(station.CONNECT, flying.endpoint)
-        monkeypatch.setenv(station.VEHICLE, "x500")
-        monkeypatch.delenv(station.KEYS, raising=False)
-        yield flying
 
 
 def lines_until(process: subprocess.Popen[str], part: str) -> list[str]:

@@ -3,34 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 
 import pytest
 
-from groundstation import codes, station
-from groundstation.client import Client, StationSettings
+from groundstation import codes
 from onboard.config import load_config
-from onboard.wire import ReloadParams, SaveParams, SetParams, ShowParams, TakeLease
-from tests.groundstation.craft import Craft, command, craft
-from tests.waiting import LONG
+from onboard.wire import ReloadParams, SaveParams, SetParams, ShowParams
+from tests.groundstation.craft import Craft, command
 
 Told = pytest.CaptureFixture[str]
-
-
-@pytest.fixture
-def vehicle(monkeypatch: pytest.MonkeyPatch) -> Iterator[Craft]:
-    with craft() as flying:
-        monkeypatch.setenv(station.CONNECT, flying.endpoint)
-        monkeypatch.setenv(station.VEHICLE, "x500")
-        monkeypatch.delenv(station.KEYS, raising=False)
-        yield flying
-
-
-@pytest.fixture
-def commanding(vehicle: Craft) -> Iterator[None]:
-    with Client(StationSettings("x500", (vehicle.endpoint,), "alice", plain=True), timeout=LONG) as client:
-        client.ask(TakeLease())
-        yield
 
 
 def params(*arguments: str) -> int:

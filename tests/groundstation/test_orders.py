@@ -5,36 +5,18 @@ from __future__ import annotations
 import json
 import os
 import pty
-from collections.abc import Iterator
 
 import pytest
 
-from groundstation import codes, station
-from groundstation.client import Client, StationSettings
+from groundstation import codes
+from groundstation.client import Client
 from onboard.core.types import Phase, Request
-from onboard.wire import Arm, Ask, Go, Mission, Stop, TakeLease, Tare
-from tests.groundstation.craft import Craft, command, craft, process
+from onboard.wire import Arm, Ask, Go, Mission, Stop, Tare
+from tests.groundstation.craft import Craft, command, process
 from tests.waiting import LONG, seconds_until
 
 Told = pytest.CaptureFixture[str]
 KILL = Mission(Request.KILL)
-
-
-@pytest.fixture
-def vehicle(monkeypatch: pytest.MonkeyPatch) -> Iterator[Craft]:
-    with craft() as flying:
-        monkeypatch.setenv(station.CONNECT, flying.endpoint)
-        monkeypatch.setenv(station.VEHICLE, "x500")
-        monkeypatch.delenv(station.KEYS, raising=False)
-        yield flying
-
-
-@pytest.fixture
-def commanding(vehicle: Craft) -> Iterator[Client]:
-    """Somebody of the name alice has the lease and stays."""
-    with Client(StationSettings("x500", (vehicle.endpoint,), "alice", plain=True), timeout=LONG) as client:
-        client.ask(TakeLease())
-        yield client
 
 
 def alice(*arguments: str) -> int:

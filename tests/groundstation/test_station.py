@@ -12,7 +12,7 @@ from groundstation import codes, station
 from onboard.admission import vehicle_security
 from onboard.roster import Role, Roster
 from onboard.wire import Outcome, Stop
-from tests.groundstation.craft import Craft, command, craft, process
+from tests.groundstation.craft import Craft, command, process
 from tests.waiting import LONG
 from tests.zenoh_sessions import Fleet, free_port
 
@@ -21,14 +21,6 @@ from tests.zenoh_sessions import Fleet, free_port
 def environment(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in (station.CONNECT, station.VEHICLE, station.KEYS):
         monkeypatch.delenv(name, raising=False)
-
-
-@pytest.fixture
-def vehicle(monkeypatch: pytest.MonkeyPatch) -> Iterator[Craft]:
-    with craft() as flying:
-        monkeypatch.setenv(station.CONNECT, flying.endpoint)
-        monkeypatch.setenv(station.VEHICLE, "x500")
-        yield flying
 
 
 Told = pytest.CaptureFixture[str]

@@ -5,30 +5,20 @@ from __future__ import annotations
 import json
 import math
 import signal
-from collections.abc import Iterator
 
 import pytest
 from msgspec.structs import replace
 
 from drivers.samples import SERVO_NAMES
-from groundstation import codes, station, status
+from groundstation import codes, status
 from groundstation.status import Status, brief, lines
 from onboard.core.types import Action, Severity, Verdict
-from tests.groundstation.craft import TICK, Craft, command, craft, process
+from tests.groundstation.craft import TICK, Craft, command, process
 from tests.synthetic import mission
 from tests.waiting import LONG, seconds_until
 
 Told = pytest.CaptureFixture[str]
 BARE = Status("x500", "alice", "", False, 0.05, 0.002, 0.0, 0, None)
-
-
-@pytest.fixture
-def vehicle(monkeypatch: pytest.MonkeyPatch) -> Iterator[Craft]:
-    with craft() as flying:
-        monkeypatch.setenv(station.CONNECT, flying.endpoint)
-        monkeypatch.setenv(station.VEHICLE, "x500")
-        monkeypatch.delenv(station.KEYS, raising=False)
-        yield flying
 
 
 def test_for_a_person(vehicle: Craft, capsys: Told) -> None:

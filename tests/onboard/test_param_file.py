@@ -187,7 +187,7 @@ def test_without_another_the_defaults_are_compared() -> None:
             "interface": st.sampled_from(["wrench", "attitude", "body_rate"]),
             "devices.autopilot.url": st.sampled_from(["udpin://0.0.0.0:14540", "", "off", "a # b: c"]),
             "process.cpu": st.lists(st.integers(0, 7), max_size=3),
-            "world.sensors.ideal": st.booleans(),
+            "world.sensors.servos.grain": st.booleans(),
         },
     )
 )

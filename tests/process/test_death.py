@@ -40,6 +40,8 @@ def test_the_vehicle_ends_on_the_ground(tmp_path: Path, way: int, where: str) ->
         down = flight.ended_safely()
         assert down.received[SET_POINT] == last.received[SET_POINT]
         assert down.received.get("ODOMETRY") == last.received.get("ODOMETRY")
+        if way == signal.SIGUSR1:
+            flight.signal(signal.SIGKILL)  # nothing else would end what spins
     assert flight.flight.returncode is not None
     ticks = replay(tmp_path / "log.mcap", partial=True)
     assert ticks.same, ticks

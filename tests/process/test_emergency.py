@@ -43,6 +43,7 @@ def test_a_kill_with_the_loop_stuck(tmp_path: Path) -> None:
         assert (cut.t_ns - asked) * 1e-9 < SOON
         limp = flight.wait("joints that let go", lambda look: not any(look.truth.servo_current), since=before)
         assert (limp.t_ns - asked) * 1e-9 < SOON
+        flight.signal(signal.SIGKILL)  # nothing else would end what spins
 
 
 def test_a_stop_with_the_loop_stuck(tmp_path: Path) -> None:
@@ -58,3 +59,4 @@ def test_a_stop_with_the_loop_stuck(tmp_path: Path) -> None:
         lands = flight.wait("a landing", lambda look: look.mode == "land", since=before)
         assert (lands.t_ns - asked) * 1e-9 < LOSS - 0.1
         flight.ended_safely()
+        flight.signal(signal.SIGKILL)

@@ -11,15 +11,15 @@ from pymavlink.dialects.v20 import common as mavlink
 from drivers.samples import FlightMode, Vec3
 from drivers.vehicle import Vehicle
 from sim_backend.px4_emulator import Px4StandIn
-from sim_backend.sensors import SensorParams
 from sim_backend.world import World, WorldParams
+from tests.sim_backend.noisy import NOISY
 from tests.sim_backend.px4_client import ACCEPTED, LAND, SET_MODE, Client, of
 
 
 @pytest.fixture
 def client(vehicle: Vehicle) -> Iterator[Client]:
     """A vehicle whose IMU has noise and bias."""
-    stand_in = Px4StandIn(World(vehicle, WorldParams(sensors=SensorParams(ideal=False))))
+    stand_in = Px4StandIn(World(vehicle, WorldParams(sensors=NOISY)))
     client = Client(stand_in)
     client.sees = True
     yield client

@@ -11,8 +11,8 @@ from drivers.samples import FlightMode, Landed
 from drivers.vehicle import Vehicle
 from sim_backend.faults import Fault, Kind
 from sim_backend.px4_emulator import Px4StandIn
-from sim_backend.sensors import SensorParams
 from sim_backend.world import World, WorldParams
+from tests.sim_backend.noisy import NOISY
 from tests.sim_backend.px4_client import ACCEPTED, ARM, INTERVAL, OFFBOARD, SET_MODE, Client, of
 
 Make = Callable[..., Client]
@@ -23,7 +23,7 @@ def make(vehicle: Vehicle) -> Iterator[Make]:
     clients: list[Client] = []
 
     def client(*faults: Fault) -> Client:
-        world = World(vehicle, WorldParams(sensors=SensorParams(ideal=False)))
+        world = World(vehicle, WorldParams(sensors=NOISY))
         made = Client(Px4StandIn(world, faults=faults))
         clients.append(made)
         made.run(0.02)

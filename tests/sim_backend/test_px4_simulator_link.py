@@ -31,6 +31,7 @@ from sim_backend.px4_simulator_link import LinkParams, Px4SimulatorLink, main
 from sim_backend.sensors import SensorParams
 from sim_backend.world import World, WorldParams
 from tests.sim_backend.flying import mass_of
+from tests.sim_backend.noisy import NOISY
 
 ANY_PORT = "tcp://127.0.0.1:0"
 ARMED, LOCKSTEP = 128, 1
@@ -377,8 +378,12 @@ def test_no_px4_is_told(vehicle: Vehicle, rig: Rig) -> None:
 # -- sensors --------------------------------------------------------------------------------------------------------
 
 
+#: Thrust of one rotor in hover, N.
+HOVER = 5.9
+
+
 def settled(vehicle: Vehicle, seed: int = 0, ideal: bool = True) -> World:
-    world = World(vehicle, WorldParams(sensors=SensorParams(ideal=ideal)), seed=seed)
+    world = World(vehicle, WorldParams(sensors=SensorParams() if ideal else NOISY), seed=seed)
     world.advance(0.1)
     return world
 
@@ -386,7 +391,7 @@ def settled(vehicle: Vehicle, seed: int = 0, ideal: bool = True) -> World:
 def test_sensors_of_a_vehicle_at_rest(vehicle: Vehicle) -> None:
     """It stands level and looks east, so that north is on its left. Compass and barometer are never without noise."""
     world = settled(vehicle)
-    (m,) = Px4Sensors(SensorParams()).measure(world.snapshot)
+    (m,) = Px4Sensors(SensorParams(), HOVER).measure(world.snapshot)
     assert (m.xacc, m.yacc, m.zacc) == pytest.approx((0.0, 0.0, -vehicle.gravity), abs=0.02)
     assert (m.xgyro, m.ygyro, m.zgyro) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
     assert (m.xmag, m.ymag, m.zmag) == pytest.approx((0.0, -0.215, 0.427), abs=0.01)
@@ -402,7 +407,7 @@ def test_pressure_is_the_standard_atmospheres() -> None:
 
 
 def test_fields_come_at_their_own_rates(vehicle: Vehicle) -> None:
-    world, sensors = settled(vehicle), Px4Sensors(SensorParams(), gps=True)
+    world, sensors = settled(vehicle), Px4Sensors(SensorParams(), HOVER, gps=True)
     seen = [sensors.measure(world.snapshot) for _ in range(150)]
     fields = [batch[0].fields_updated for batch in seen]
     assert all(field & 0x3F == 0x3F for field in fields)
@@ -415,7 +420,7 @@ def test_noise_is_that_of_the_world_and_follows_the_seed(vehicle: Vehicle) -> No
     inertial = world.params.sensors
 
     def series(seed: int) -> list[float]:
-        sensors = Px4Sensors(inertial, seed=seed)
+        sensors = Px4Sensors(inertial, HOVER, seed=seed)
         return [sensors.measure(world.snapshot)[0].yacc for _ in range(1000)]
 
     first = series(3)
@@ -433,7 +438,7 @@ def test_gps_tells_north_as_plus_y(vehicle: Vehicle) -> None:
     moved = list(snapshot.x)
     moved[at.POSITION : at.POSITION + 3] = (30.0, 100.0, 7.0)
     moved[at.VELOCITY : at.VELOCITY + 3] = (1.0, 2.0, 3.0)
-    m = Px4Sensors(SensorParams(), place, gps=True).measure(snapshot._replace(x=moved))[1]
+    m = Px4Sensors(SensorParams(), HOVER, place, gps=True).measure(snapshot._replace(x=moved))[1]
     assert m.lat / 1e7 - place.latitude == pytest.approx(100.0 / 111_319.5, rel=1e-3)
     assert m.lon / 1e7 - place.longitude == pytest.approx(30.0 / 75_360.0, rel=1e-2)
     assert m.alt == 495_000

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from math import pi
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -14,13 +13,12 @@ from sim_backend.sensors import (
     AutopilotSensorParams,
     OdometryParams,
     SensorParams,
-    Sensors,
     ServoSensorParams,
 )
 from sim_backend.world import World, WorldParams
 from tests.sim_backend.flying import PIPE, RADIUS
+from tests.sim_backend.noisy import NOISY
 
-NOISY = SensorParams(ideal=False)
 TICK = 0.004
 
 
@@ -49,7 +47,6 @@ def test_ideal_measurements_are_the_truth_of_now(vehicle: Vehicle) -> None:
 
 def test_noise_has_the_size_that_is_asked_for(vehicle: Vehicle) -> None:
     params = SensorParams(
-        ideal=False,
         odometry=OdometryParams(period=TICK, delay=0.0, position_noise=0.002, position_drift=0.0, velocity_noise=0.03),
         autopilot=AutopilotSensorParams(
             period=TICK, delay=0.0, gyro_noise=0.02, gyro_bias=0.0, accelerometer_noise=0.1, accelerometer_bias=0.0,
@@ -97,7 +94,7 @@ def test_biases_are_constant_and_drift_is_slow(vehicle: Vehicle) -> None:
         period=TICK, delay=0.0, gyro_noise=0.0, gyro_bias=0.1, accelerometer_noise=0.0, accelerometer_bias=1.0,
         attitude_noise=0.0, attitude_drift=0.05, drift_time=1.0,
     )  # fmt: skip
-    world = world_with(vehicle, SensorParams(ideal=False, autopilot=quiet))
+    world = world_with(vehicle, SensorParams(autopilot=quiet))
     truth = world.truth()
     tilts = []
     first = world.sensors.autopilot(world.snapshot)
@@ -143,7 +140,7 @@ def test_the_mean_rate_holds_where_the_ticks_do_not_fit(vehicle: Vehicle) -> Non
 
 
 def test_encoders_have_their_grain(vehicle: Vehicle) -> None:
-    world = world_with(vehicle, msgspec.structs.replace(NOISY, servos=ServoSensorParams(delay=0.0)))
+    world = world_with(vehicle, SensorParams(servos=ServoSensorParams(grain=True)))
     world.advance(TICK)
     servos = world.sensors.servos(world.snapshot)
     assert servos is not None
@@ -168,22 +165,3 @@ def test_same_seed_same_samples_however_often_asked(vehicle: Vehicle) -> None:
 
     assert record(3, 1) == record(3, 4)
     assert record(3, 1) != record(4, 1)
-
-
-def test_vibration_shakes_only_while_armed(vehicle: Vehicle) -> None:
-    still = AutopilotSensorParams(delay=0.0, accelerometer_noise=0.0, accelerometer_bias=0.0, vibration=2.0)
-    sensors = Sensors(SensorParams(ideal=False, autopilot=still), vehicle, 0)
-    world = world_with(vehicle, SensorParams())
-    spread = {}
-    for armed in (False, True):
-        seen = []
-        for _ in range(200):
-            world.advance(TICK)
-            now = world.snapshot._replace(armed=armed)
-            sensors.observe(now)
-            state = sensors.autopilot(now)
-            assert state is not None
-            seen.append(state.f_B[0] - world.truth().f_B[0])
-        spread[armed] = max(seen) - min(seen)
-    assert spread[False] == pytest.approx(0.0, abs=1e-9)
-    assert spread[True] == pytest.approx(4.0, rel=0.05)

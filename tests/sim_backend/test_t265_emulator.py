@@ -144,7 +144,7 @@ def test_nothing_is_sent_twice(watch: Watch) -> None:
 
 
 def test_the_worlds_noise_and_delay_are_the_cameras(vehicle: Vehicle) -> None:
-    noisy = SensorParams(ideal=False, odometry=OdometryParams(delay=0.02, position_noise=0.01))
+    noisy = SensorParams(odometry=OdometryParams(period=0.005, delay=0.02, position_noise=0.01))
     world = World(vehicle, WorldParams(sensors=noisy))
     watch = Watch(world, T265Emulator(world))
     watch.open()

@@ -15,9 +15,9 @@ from drivers.vehicle import Vehicle
 from sim_backend.array_plant import PlantParams
 from sim_backend.autopilot import AutopilotParams, SetPoint
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
-from sim_backend.sensors import SensorParams
 from sim_backend.world import World, WorldParams
 from tests.sim_backend.flying import TICK, Hand, mass_of, world_at_pipe
+from tests.sim_backend.noisy import NOISY
 
 UP = (0.0, 0.0, 1.0)
 HOLD = ServoCommand(JointMode.POSITION, (0.0, 0.0, 0.0), (-2.8, -0.35, 0.0, 0.0, 0.0), 1.8)
@@ -88,7 +88,7 @@ def test_every_interface_takes_off_and_hovers(vehicle: Vehicle, interface: Inter
 @pytest.mark.parametrize("interface", list(Interface))
 def test_it_flies_with_nothing_ideal(vehicle: Vehicle, interface: Interface) -> None:
     plant = PlantParams(ideal_motors=False, ideal_servos=False)
-    world = World(vehicle, WorldParams(plant=plant, sensors=SensorParams(ideal=False)), seed=2)
+    world = World(vehicle, WorldParams(plant=plant, sensors=NOISY), seed=2)
     # The first samples are still on their way.
     world.advance(0.04)
     hand = Hand(world, interface)
@@ -266,9 +266,7 @@ def test_a_servo_goal_that_is_not_finite_is_ignored(hand: Hand) -> None:
 
 def test_same_calls_same_bits(vehicle: Vehicle) -> None:
     def run(seed: int, step: float = 1e-4) -> list[list[float]]:
-        params = WorldParams(
-            plant=PlantParams(step=step, ideal_motors=False, ideal_servos=False), sensors=SensorParams(ideal=False)
-        )
+        params = WorldParams(plant=PlantParams(step=step, ideal_motors=False, ideal_servos=False), sensors=NOISY)
         world = World(vehicle, params, seed=seed)
         hand = Hand(world)
         for _ in range(20):
