@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from enum import StrEnum
 from math import cos, floor, hypot, isfinite, pi, sin, sqrt
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from msgspec import Struct
@@ -163,6 +163,9 @@ class ArrayPlant(ABC):
     holds.
     """
 
+    #: Time the vehicle is given to settle on its skids before the start, s.
+    SETTLING: ClassVar[float] = 3.0
+
     def __init__(
         self,
         vehicle: Vehicle,
@@ -204,11 +207,12 @@ class ArrayPlant(ABC):
         u[at.U_TORQUE_ON] = 1.0
         u[at.U_CURRENT_LIMIT] = self.vehicle.servo.stall_current
         self.begin()
-        self.move(round(SETTLING_TIME / self.step))
+        steps = round(self.SETTLING / self.step)
+        self.move(steps)
         x[at.POSITION : at.POSITION + 2] = 0.0
         x[at.CHARGE] = 1.0
         x[at.TIP_SLIP] = 0.0
-        self.last_steps = round(SETTLING_TIME / self.step)
+        self.last_steps = steps
 
     def begin(self) -> None:
         """Begin an advance: the figures that are kept per advance begin anew."""
@@ -252,10 +256,6 @@ class ArrayPlant(ABC):
     def truth(self) -> Truth:
         """What is true now."""
         return truth_of(self.x.tolist(), self.time, self.last_steps)
-
-
-#: Time the vehicle is given to settle on its skids before the start, s.
-SETTLING_TIME = 3.0
 
 
 def truth_of(x: list[float], t: float, steps: int) -> Truth:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from math import pi
 from pathlib import Path
+from subprocess import run
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -44,6 +45,13 @@ def _load_bullet() -> Any:
         os.close(nothing)
 
 
+def _check_screen() -> None:
+    """Raises NoBulletError where no window can be opened: Bullet ends the whole process there."""
+    trial = "import pybullet; raise SystemExit(pybullet.connect(pybullet.GUI) < 0)"
+    if run((sys.executable, "-c", trial), capture_output=True, check=False).returncode:
+        raise NoBulletError("bullet.window: no window can be opened here; is there a screen?")
+
+
 class Scene:
     """The bodies in one Bullet client. ``window`` shows them on the screen; ``bars`` adds the parallelograms' bars.
 
@@ -57,9 +65,9 @@ class Scene:
         text = urdf(vehicle, bars, centre)
         self.centre = centre
         self.bullet = bullet = _load_bullet()
+        if window:
+            _check_screen()
         self.client: int = bullet.connect(bullet.GUI if window else bullet.DIRECT)
-        if self.client < 0:
-            raise NoBulletError("bullet.window: no window can be opened here; is there a screen?")
         bullet.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
         with TemporaryDirectory(prefix="pipewright-") as folder:
             path = Path(folder) / "vehicle.urdf"

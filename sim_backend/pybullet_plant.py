@@ -8,7 +8,8 @@ comes back into the array ``x``, so that everything around a plant sees no diffe
 from __future__ import annotations
 
 import weakref
-from math import hypot
+from copy import copy
+from math import hypot, nan
 from typing import Any
 
 import numpy as np
@@ -146,6 +147,9 @@ def _let_go(x: Array, p: Array) -> None:
 class PyBulletPlant(ArrayPlant):
     """The plant that PyBullet moves. Raises ValueError when PyBullet is not there, or for an arm it cannot have."""
 
+    # A second is dear here, and by then nothing moves by more than 1e-7 rad/s.
+    SETTLING = 1.0
+
     def __init__(
         self,
         vehicle: Vehicle,
@@ -157,23 +161,35 @@ class PyBulletPlant(ArrayPlant):
         truth: Deviations = AS_MODELLED,
     ) -> None:
         super().__init__(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
-        centre, real = truth.base_centre(vehicle), truth.vehicle(vehicle)
-        servo = replace(real.servo, rotor_inertia=params.rotor_inertia(real))
+        servo = replace(vehicle.servo, rotor_inertia=params.rotor_inertia(vehicle))
+        self._real = replace(truth.vehicle(vehicle), servo=servo)
+        self._centre = np.array(truth.base_centre(vehicle))
+        self._pipe = (*truth.pipe_pose(pipe_position, pipe_heading), pipe_radius, pipe_length)
+        self._build()
+        self.stand()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> PyBulletPlant:
+        """The same moment on its own from here; a sleeve that was let go is at the gripper again, and goes anew."""
+        twin = copy(self)
+        twin.x, twin.p, twin.u = self.x.copy(), self.p.copy(), self.u.copy()
+        twin._build()
+        return twin
+
+    def _build(self) -> None:
+        """Make the scene; what is in the arrays is told to it before the next step."""
         try:
-            self.scene = scene = Scene(replace(real, servo=servo), window=params.bullet.window, centre=centre)
+            self.scene = scene = Scene(self._real, self.params.bullet.window, centre=tuple(self._centre.tolist()))
         except NoBulletError as error:
             raise ValueError(f"world.plant.kind = pybullet: {error}; or choose rigid") from error
         self._finalizer = weakref.finalize(self, scene.close)
         self._bullet: Any = scene.bullet
-        scene.prepare(params, self.step)
-        scene.put_pipe(*truth.pipe_pose(pipe_position, pipe_heading), pipe_radius, pipe_length)
-        self._centre = np.array(centre)
+        scene.prepare(self.params, self.step)
+        scene.put_pipe(*self._pipe)
         self._out = np.zeros(_DRIVE_SIZE)
         self._moved = np.zeros(_MOVED_SIZE)
-        self._known_x = np.zeros(at.ACCELERATION)
-        self._known_p = self.p[: at.LUMPED].copy()
+        self._known_x = np.full(at.ACCELERATION, nan)
+        self._known_p = np.full(at.LUMPED, nan)
         self._frame_on_ground = False
-        self.stand()
 
     def move(self, steps: int) -> None:
         """Move ``x`` on by so many physics steps under the drive ``u`` as it stands."""
