@@ -228,7 +228,8 @@ def _write_film(studio: _Studio, poses: list[Pose], sheet: Picture, path: Path, 
     """The film, in the colours of the sheet for all frames so that nothing flickers."""
     from PIL import Image
 
-    palette = sheet.quantize(96)
+    # An octree keeps what is small and bright: arm and sleeve beside all that floor.
+    palette = sheet.quantize(128, method=Image.Quantize.FASTOCTREE)
     pictures = [studio.picture(pose).quantize(palette=palette, dither=Image.Dither.NONE) for pose in poses]
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=round(1000.0 / fps), loop=0, optimize=False

@@ -17,6 +17,7 @@ from tests.bench.flight import Flight
 from tests.bench.lateness import Lateness
 from tests.bench.servos import ServoCycle
 from tests.bench.setpoints import SetPoints
+from tests.bench.worlds import Worlds
 
 #: What a desk core must reach in the median, so that a Jetson Nano holds 250 Hz, us.
 TARGET_US = 150
@@ -28,6 +29,7 @@ class Report(Struct, frozen=True):
     conditions: dict[str, str]
     core: Core
     flight: Flight
+    worlds: Worlds
     comparisons: tuple[Comparison, ...]
     servos: tuple[ServoCycle, ...]
     setpoints: SetPoints

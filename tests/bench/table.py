@@ -6,6 +6,7 @@ from tests.bench.core import Part
 from tests.bench.desk import Desk
 from tests.bench.emergency.measure import Emergency
 from tests.bench.emergency.stations import PATIENCE
+from tests.bench.flight import Flight
 from tests.bench.measure import Stat
 from tests.bench.report import TARGET_US, Report
 
@@ -16,7 +17,7 @@ _EIGHTHS = " ▏▎▍▌▋▊▉"
 
 def table(report: Report) -> str:
     """All of a report, section by section."""
-    parts = (_conditions, _core, _flight, _comparisons, _real_time)
+    parts = (_conditions, _core, _mission, _worlds, _comparisons, _real_time)
     lines = [line for part in parts for line in part(report)]
     if report.emergency is not None:
         lines += emergency_rows(report.emergency)
@@ -60,9 +61,12 @@ def _core(report: Report) -> list[str]:
     return lines
 
 
-def _flight(report: Report) -> list[str]:
-    f = report.flight
-    lines = _head(f"Mission, {f.sim_s:.1f} s to {f.ended_in}", "median us", "p99 us", "of wall")
+def _mission(report: Report) -> list[str]:
+    return _flight(report.flight, "Mission")
+
+
+def _flight(f: Flight, name: str) -> list[str]:
+    lines = _head(f"{name}, {f.sim_s:.1f} s to {f.ended_in}", "median us", "p99 us", "of wall")
 
     def share(seconds: float) -> str:
         return f"{100.0 * seconds / f.wall_s:>9.1f} %   "
@@ -72,7 +76,7 @@ def _flight(report: Report) -> list[str]:
         _line(
             f"world, a tick of {f.steps_per_tick} steps",
             f.world,
-            share(f.world_s) + f"{f.steps_per_s / 1e6:.2f} M steps/s, {f.speed:.0f} x real time",
+            share(f.world_s) + f"{f.steps_per_s / 1e3:.3g} k steps/s, {f.speed:.3g} x real time",
         )
     )
     lines.append(
@@ -86,6 +90,23 @@ def _flight(report: Report) -> list[str]:
     lines.append(f"{'loop, devices, clock':<{_NAME}}{'':>22}" + share(rest).rstrip())
     whole = f"{f.wall_s:.2f} s of wall time for {f.sim_s:.1f} s simulated"
     lines.append(f"{'whole mission':<{_NAME}}{whole}: {f.sim_s / f.wall_s:.1f} times real time")
+    return lines
+
+
+def _worlds(report: Report) -> list[str]:
+    worlds = report.worlds
+    if worlds.bullet is None:
+        lines = [*_head("Mission in PyBullet"), worlds.missing]
+    else:
+        lines = _flight(worlds.bullet, "In PyBullet")
+    lines += _head("A quadrotor without an arm", "median us", "p99 us", "steps/s")
+    for row in worlds.quadrotor:
+        name = f"{row.package}, {row.step_s * 1e3:g} ms"
+        if row.time is None:
+            lines.append(name)
+            continue
+        rate = 1e6 / row.time.mean
+        lines.append(_line(name, row.time, f"{rate / 1e3:>9.2f} k   {rate * row.step_s:.3g} x real time"))
     return lines
 
 

@@ -18,25 +18,13 @@ from sim_backend.plant import Truth
 from sim_backend.pybullet_plant import PyBulletPlant
 from sim_backend.rigid_body import RigidBody
 from sim_backend.world import World, WorldParams
-from tests.sim_backend.flying import PIPE, RADIUS, REACH, Hand, mass_of, world_at_pipe
+from tests.sim_backend.flying import PIPE, RADIUS, REACH, Hand, mass_of, to_bullet, world_at_pipe
 
 BULLET = PlantParams(kind=PlantKind.PYBULLET)
 
 
 def bullet_plant(vehicle: Vehicle, params: PlantParams = BULLET) -> PyBulletPlant:
     return PyBulletPlant(vehicle, params, PIPE, 0.0, RADIUS)
-
-
-def taken_over(hand: Hand, plant: PyBulletPlant) -> Hand:
-    """The same flight from here on in PyBullet; the first goes on by itself."""
-    twin = deepcopy(hand)
-    plant.x[:], plant.u[:] = hand.world.plant.x, hand.world.plant.u
-    plant.p[at.LOOP :] = hand.world.plant.p[at.LOOP :]
-    plant.p[at.LOOP_STEPS] *= hand.world.plant.step / plant.step
-    plant.x[at.PHASE] = 0.0
-    plant.steps = round(hand.world.time / plant.step)
-    twin.world.plant = plant
-    return twin
 
 
 def moved(plant: ArrayPlant, seconds: float) -> Truth:
@@ -114,9 +102,8 @@ def at_pipe(vehicle: Vehicle) -> Hand:
 
 
 def test_both_press_alike_and_leave_the_sleeve(vehicle: Vehicle, at_pipe: Hand) -> None:
-    one, other = deepcopy(at_pipe), taken_over(at_pipe, bullet_plant(vehicle))
-    plant = other.world.plant
-    assert isinstance(plant, PyBulletPlant)
+    one, other = deepcopy(at_pipe), deepcopy(at_pipe)
+    plant = to_bullet(other.world)
     rigid, bullet = (hand.press(3.0, speed=0.1, depth=0.15) for hand in (one, other))
     assert bullet[-1, 0] > 0.5
     assert np.abs(rigid[-250:, 0] - bullet[-250:, 0]).max() < 0.03
@@ -140,10 +127,9 @@ def weight(plant: PyBulletPlant) -> float:
     return sum(b.getDynamicsInfo(body, link, client)[0] for link in range(-1, b.getNumJoints(body, client)))
 
 
-def test_a_sleeve_let_go_in_the_air_falls(vehicle: Vehicle, at_pipe: Hand) -> None:
-    hand = taken_over(at_pipe, bullet_plant(vehicle))
-    plant = hand.world.plant
-    assert isinstance(plant, PyBulletPlant)
+def test_a_sleeve_let_go_in_the_air_falls(at_pipe: Hand) -> None:
+    hand = deepcopy(at_pipe)
+    plant = to_bullet(hand.world)
     hand.gripper = 1.2
     hand.fly(hand.world.truth().p_WB, 0.4)
     truth = hand.world.truth()
@@ -178,14 +164,28 @@ def test_a_tip_that_is_pushed_too_hard_slides(vehicle: Vehicle, unevenness: floa
     assert peaks[0] == pytest.approx(peaks[1], rel=0.1), "as stiff, and as damped"
 
 
-def test_two_runs_of_one_seed_are_the_same_to_the_bit(vehicle: Vehicle, at_pipe: Hand) -> None:
+def test_two_runs_of_one_seed_are_the_same_to_the_bit(at_pipe: Hand) -> None:
     def run() -> tuple[bytes, bytes]:
-        hand = taken_over(at_pipe, bullet_plant(vehicle))
+        hand = deepcopy(at_pipe)
+        to_bullet(hand.world)
         rows = hand.press(1.0, speed=0.2)
         assert rows[-1, 0] > 0.0
         return hand.world.plant.x.tobytes(), rows.tobytes()
 
     assert run() == run()
+
+
+def test_a_copy_goes_its_own_way(vehicle: Vehicle) -> None:
+    one = bullet_plant(vehicle)
+    one.x[at.POSITION + 2] = 5.0
+    moved(one, 0.01)
+    twin = deepcopy(one)
+    after, again = moved(one, 0.05), moved(twin, 0.05)
+    assert again.t == after.t
+    assert again.p_WB == pytest.approx(after.p_WB, abs=1e-9)
+    assert again.joints == pytest.approx(after.joints, abs=1e-6)
+    twin.x[at.POSITION] = 1.0
+    assert moved(one, 0.01).p_WB[0] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_what_is_written_into_the_arrays_holds(vehicle: Vehicle) -> None:
