@@ -11,7 +11,7 @@ import msgspec
 
 from onboard.config import load_config
 from onboard.layers import ConfigError
-from tests.bench import compare, core, desk, flight, lateness, servos, setpoints, worlds
+from tests.bench import compare, core, desk, flight, lateness, servos, setpoints
 from tests.bench.emergency import measure
 from tests.bench.report import Report, conditions
 from tests.bench.table import table
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         before,
         stepped,
         flown,
-        worlds.measure(config, given.longest),
+        flight.fly_in_pybullet(config, given.longest),
         compare.compare(config.fuzzy, config.vehicle),
         servos.rows(given.cycles // 2),
         setpoints.measure(given.cycles),

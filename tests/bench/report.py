@@ -17,7 +17,6 @@ from tests.bench.flight import Flight
 from tests.bench.lateness import Lateness
 from tests.bench.servos import ServoCycle
 from tests.bench.setpoints import SetPoints
-from tests.bench.worlds import Worlds
 
 #: What a desk core must reach in the median, so that a Jetson Nano holds 250 Hz, us.
 TARGET_US = 150
@@ -29,7 +28,8 @@ class Report(Struct, frozen=True):
     conditions: dict[str, str]
     core: Core
     flight: Flight
-    worlds: Worlds
+    bullet: Flight | None
+    """The same mission in PyBullet; None where that is not installed."""
     comparisons: tuple[Comparison, ...]
     servos: tuple[ServoCycle, ...]
     setpoints: SetPoints

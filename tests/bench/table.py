@@ -17,7 +17,7 @@ _EIGHTHS = " ▏▎▍▌▋▊▉"
 
 def table(report: Report) -> str:
     """All of a report, section by section."""
-    parts = (_conditions, _core, _mission, _worlds, _comparisons, _real_time)
+    parts = (_conditions, _core, _mission, _other_world, _comparisons, _real_time)
     lines = [line for part in parts for line in part(report)]
     if report.emergency is not None:
         lines += emergency_rows(report.emergency)
@@ -93,21 +93,10 @@ def _flight(f: Flight, name: str) -> list[str]:
     return lines
 
 
-def _worlds(report: Report) -> list[str]:
-    worlds = report.worlds
-    if worlds.bullet is None:
-        lines = [*_head("Mission in PyBullet"), worlds.missing]
-    else:
-        lines = _flight(worlds.bullet, "In PyBullet")
-    lines += _head("A quadrotor without an arm", "median us", "p99 us", "steps/s")
-    for row in worlds.quadrotor:
-        name = f"{row.package}, {row.step_s * 1e3:g} ms"
-        if row.time is None:
-            lines.append(name)
-            continue
-        rate = 1e6 / row.time.mean
-        lines.append(_line(name, row.time, f"{rate / 1e3:>9.2f} k   {rate * row.step_s:.3g} x real time"))
-    return lines
+def _other_world(report: Report) -> list[str]:
+    if report.bullet is None:
+        return [*_head("In PyBullet"), "skipped: pybullet is not installed"]
+    return _flight(report.bullet, "In PyBullet")
 
 
 def _comparisons(report: Report) -> list[str]:
