@@ -16,6 +16,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import IO
 
+from onboard.scheduling import prefer
+
 #: The first world on a machine compiles before it answers, s.
 WORLD_PATIENCE = 180.0
 #: A child that has been told to end gets this long, s.
@@ -106,9 +108,7 @@ def start(
     """Start an onboard process in a process group of its own, attended through its standard input."""
     command = [sys.executable, "-P", *program, *arguments]
     child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, text=True, process_group=0)
-    # Where the machine grants it (root, RLIMIT_RTPRIO), so that what else runs there is not what is measured.
-    with suppress(OSError):
-        os.sched_setscheduler(child.pid, os.SCHED_FIFO, os.sched_param(_PRIORITY[arguments[0]]))
+    prefer(child.pid, _PRIORITY[arguments[0]])
     return child
 
 

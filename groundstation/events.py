@@ -98,7 +98,8 @@ def as_line(told: Told, contact: Contact) -> str:
     """One event for a person, at the local time of this machine."""
     event, when = told.event, _time(told, contact)
     clock = f"{when.astimezone():%H:%M:%S.%f}"[:-3] if when is not None else "--:--:--.---"
-    return f"{clock}  {event.severity.upper():7}  {event.code}: {event.text}"
+    # a device begins its sentences with its name, for those who see no code
+    return f"{clock}  {event.severity.upper():7}  {event.code}: {event.text.removeprefix(f'{event.code}: ')}"
 
 
 def as_data(told: Told, contact: Contact) -> dict[str, Any]:

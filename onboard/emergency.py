@@ -12,7 +12,7 @@ from threading import Event, Lock, Thread
 from time import monotonic_ns
 from typing import Final, Protocol
 
-from drivers.mailbox import Level, Notice, Notices, Teller
+from drivers.mailbox import Level, Notices, Teller
 from drivers.protocols import AutopilotDevice, ServoDevice
 from drivers.samples import Engage, FlightMode
 from onboard.core.types import Outputs, Request
@@ -39,7 +39,7 @@ class Emergency:
     """Stop and kill for the devices of one vehicle, with a thread of its own from ``start`` to ``close``.
 
     request: hands a request to the loop, which calls ``done`` once it has taken it; never waits. ticked: time of the
-    newest tick whose commands are out, ns on ``clock``; 0 before the first.
+    newest tick whose commands are out, ns on ``clock``; 0 before the first. notices: where sentences go.
     """
 
     def __init__(
@@ -48,12 +48,12 @@ class Emergency:
         servos: ServoDevice,
         request: _Ask,
         ticked: Callable[[], int],
+        notices: Notices,
         clock: Callable[[], int] = monotonic_ns,
     ) -> None:
         self._autopilot, self._servos = autopilot, servos
         self._request, self._ticked, self._clock = request, ticked, clock
-        self._notices = Notices()
-        self._teller = Teller(self._notices, clock, "emergency stop")
+        self._teller = Teller(notices, clock, "emergency stop")
         self._changing = Lock()
         """Held for the change of what follows, and never longer."""
         self._wanted: Engage | None = None
@@ -120,10 +120,6 @@ class Emergency:
     def killed(self) -> bool:
         """A kill is in force."""
         return self._wanted is Engage.KILL
-
-    def notices(self) -> tuple[Notice, ...]:
-        """Sentences since the last call."""
-        return self._notices.take()
 
     # -- the thread ---------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,6 @@ from threading import Thread
 
 from msgspec import Struct
 
-from drivers.mailbox import Level
 from onboard import attended
 from onboard.clock import WallClock
 from onboard.config import Config, dump_config
@@ -38,7 +37,6 @@ from onboard.systemd import Notifier
 from sim_backend.world_messages import Look
 
 #: A driver's notice as an event of the log.
-_SEVERITY = {Level.INFO: Severity.INFO, Level.WARNING: Severity.WARNING, Level.ERROR: Severity.ERROR}
 #: A mission that has not ended by then is broken off, s.
 LONGEST = 900.0
 _REPORT_NS = 1_000_000_000
@@ -250,8 +248,10 @@ class _Flight:
         if self._stations is not None:
             self._stations.after(outputs)
             notices += [("link", notice) for notice in self._stations.notices()]
+            for event in self._stations.cries():
+                self._note(event)
         for device, notice in notices:
-            self._tell(Event(notice.t_ns, device, _SEVERITY[notice.level], notice.text))
+            self._tell(Event(notice.t_ns, device, Severity(notice.level), notice.text))
         assert self._reloader is not None
         if changes := self._reloader.events(now):
             self._notifier.ready()
@@ -270,9 +270,12 @@ class _Flight:
         self._notifier.status(outputs.phase.value)
 
     def _tell(self, event: Event) -> None:
-        self._recorder.event(event)
         if self._stations is not None:
             self._stations.event(event)
+        self._note(event)
+
+    def _note(self, event: Event) -> None:
+        self._recorder.event(event)
         self._say(event.text)
 
     def _look(self, look: Look) -> None:

@@ -8,7 +8,6 @@ before any Python runs.
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable
 from functools import partial
@@ -99,7 +98,8 @@ class Link:
         self._watch = Watch(round(settings.silence * 1e9))
         self._state = LinkState()
         self._newest: Tick | None = None
-        self._numbers = itertools.count(1)
+        self._telling = Lock()
+        """Held for the change of what follows, and never longer."""
         self._told = 0
         self._recent: tuple[Told, ...] = ()
         self._notices = Notices()
@@ -169,12 +169,12 @@ class Link:
         self._newest = tick
 
     def event(self, event: Event) -> None:
-        """Tell all stations, at once; when too many wait, it is dropped and counted."""
-        number = next(self._numbers)
-        self._told = number
-        told = Told(number, event)
-        self._recent = (*self._recent[1 - _REMEMBERED :], told)
-        self._events.put(lambda: self._publish(self._keys.event, told, _SURE))
+        """Tell all stations, at once; when too many wait, it is dropped and counted. For any thread."""
+        with self._telling:
+            self._told += 1
+            told = Told(self._told, event)
+            self._recent = (*self._recent[1 - _REMEMBERED :], told)
+            self._events.put(lambda: self._publish(self._keys.event, told, _SURE))
 
     def settle(self, asked: Asked, ack: Ack) -> None:
         """What has become of an order that was accepted. Not to be called from within ``on_order``."""

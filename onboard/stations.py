@@ -10,7 +10,7 @@ from drivers.mailbox import Level, Notice, Notices
 from drivers.protocols import AutopilotDevice, DeviceError, ServoDevice
 from onboard.admission import vehicle_security
 from onboard.core.params import Params
-from onboard.core.types import Event, LinkState, Outputs, Phase, Tick
+from onboard.core.types import Event, LinkState, Outputs, Phase, Severity, Tick
 from onboard.emergency import Emergency
 from onboard.endpoints import LinkError, ZenohConfig, unfit
 from onboard.identity import IdentityError, load_identity
@@ -45,7 +45,8 @@ class Stations:
         shows: Shows,
     ) -> None:
         self._ticked_ns = 0
-        self._emergency = Emergency(autopilot, servos, loop.request, lambda: self._ticked_ns)
+        self._cries = _Cries(lambda event: self.link.event(event))
+        self._emergency = Emergency(autopilot, servos, loop.request, lambda: self._ticked_ns, self._cries)
         orders = Orders(loop, reloader, self._emergency, lambda asked, ack: self.link.settle(asked, ack), save, shows)
         self._settings, self._security = settings, _security(settings)
         self.link = Link(settings, orders, self._security)
@@ -96,12 +97,33 @@ class Stations:
             self._emergency.release()
 
     def notices(self) -> tuple[Notice, ...]:
-        """What link and emergency have had to tell since the last call."""
-        return (*self._told.take(), *self.link.notices(), *self._emergency.notices())
+        """What the link has had to tell since the last call."""
+        return (*self._told.take(), *self.link.notices())
+
+    def cries(self) -> tuple[Event, ...]:
+        """What the emergency stop has told all stations already, since the last call."""
+        return tuple(_cry(notice) for notice in self._cries.take())
 
     def event(self, event: Event) -> None:
         """Tell of something that no tick tells of."""
         self.link.event(event)
+
+
+class _Cries(Notices):
+    """Sentences of the emergency stop: stations hear them at once, for the loop may never pass them on."""
+
+    def __init__(self, tell: Callable[[Event], None]) -> None:
+        super().__init__()
+        self._tell = tell
+
+    def tell(self, t_ns: int, level: Level, text: str) -> None:
+        """Add one sentence, and tell it."""
+        super().tell(t_ns, level, text)
+        self._tell(_cry(Notice(t_ns, level, text)))
+
+
+def _cry(notice: Notice) -> Event:
+    return Event(notice.t_ns, "emergency", Severity(notice.level), notice.text)
 
 
 def check_link(settings: LinkSettings) -> None:

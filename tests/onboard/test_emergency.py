@@ -11,6 +11,7 @@ from threading import Event, Thread
 import pytest
 from msgspec.structs import replace
 
+from drivers.mailbox import Notices
 from drivers.protocols import DeviceError
 from drivers.samples import (
     AutopilotCommand,
@@ -108,7 +109,8 @@ class Rig:
         self.autopilot, self.servos = autopilot or Autopilot(), servos or Servos()
         self.requests: list[Request] = []
         self.ticked_ns = time.monotonic_ns()
-        self.emergency = Emergency(self.autopilot, self.servos, self.request, lambda: self.ticked_ns)
+        self.notices = Notices()
+        self.emergency = Emergency(self.autopilot, self.servos, self.request, lambda: self.ticked_ns, self.notices)
         self.said: list[str] = []
 
     def request(self, request: Request, *, done: Done | None = None) -> None:
@@ -118,7 +120,7 @@ class Rig:
         self.ticked_ns = time.monotonic_ns()
 
     def says(self, words: str) -> bool:
-        self.said += [notice.text for notice in self.emergency.notices()]
+        self.said += [notice.text for notice in self.notices.take()]
         return any(words in text for text in self.said)
 
     @contextmanager
@@ -338,7 +340,7 @@ def test_a_request_that_fails_keeps_nothing(begin: Callable[..., Rig]) -> None:
         raise RuntimeError("no loop")
 
     rig = Rig()
-    rig.emergency = Emergency(rig.autopilot, rig.servos, fail, lambda: rig.ticked_ns)
+    rig.emergency = Emergency(rig.autopilot, rig.servos, fail, lambda: rig.ticked_ns, rig.notices)
     rig.emergency.kill()
     assert rig.autopilot.insisted == [Engage.KILL]
     assert rig.says("the loop failed: RuntimeError: no loop")
@@ -399,8 +401,13 @@ def test_a_loop_that_hangs_in_its_recorder() -> None:
         ticked[0] = time.monotonic_ns()
         return not over.is_set()
 
+    notices = Notices()
     emergency = Emergency(
-        devices.autopilot, devices.servos, lambda request, *, done=None: loop.request(request), lambda: ticked[0]
+        devices.autopilot,
+        devices.servos,
+        lambda request, *, done=None: loop.request(request),
+        lambda: ticked[0],
+        notices,
     )
     emergency.start()
     thread = Thread(target=lambda: asyncio.run(loop.run(on_tick)))
@@ -418,4 +425,4 @@ def test_a_loop_that_hangs_in_its_recorder() -> None:
         sink.go_on.set()
         thread.join()
         emergency.close()
-    assert [notice.text for notice in emergency.notices() if "has made no tick" in notice.text]
+    assert [notice.text for notice in notices.take() if "has made no tick" in notice.text]

@@ -6,12 +6,15 @@ import signal
 import time
 from pathlib import Path
 
-from groundstation.client import StationSettings
+from msgspec.structs import replace
+
+from groundstation.client import Client, StationSettings
 from groundstation.urgent import Urgent
 from onboard.core.types import Request
 from onboard.wire import Mission, Outcome, Stop
 from tests.process.flying import flying
 from tests.realtime import REALTIME
+from tests.waiting import seconds_until
 from tests.zenoh_sessions import free_port
 
 pytestmark = REALTIME
@@ -49,7 +52,11 @@ def test_a_kill_with_the_loop_stuck(tmp_path: Path) -> None:
 def test_a_stop_with_the_loop_stuck(tmp_path: Path) -> None:
     """The autopilot lands when it is told to, and not only when it has missed the set-points for long enough."""
     port = free_port()
-    with flying(tmp_path, f"link.listen=[tcp/127.0.0.1:{port}]") as flight, Urgent(station(port)) as urgent:
+    with (
+        flying(tmp_path, f"link.listen=[tcp/127.0.0.1:{port}]") as flight,
+        Urgent(station(port)) as urgent,
+        Client(replace(station(port), station="bob"), timeout=PATIENCE) as bob,
+    ):
         flight.hover()
         assert urgent.ask(Mission(Request.RETREAT), timeout=PATIENCE).outcome is not Outcome.REFUSED
         flight.signal(signal.SIGUSR1)
@@ -58,5 +65,6 @@ def test_a_stop_with_the_loop_stuck(tmp_path: Path) -> None:
         urgent.ask(Stop(), timeout=PATIENCE)
         lands = flight.wait("a landing", lambda look: look.mode == "land", since=before)
         assert (lands.t_ns - asked) * 1e-9 < LOSS - 0.1
+        seconds_until(lambda: any("has made no tick" in told.event.text for told in bob.events))
         flight.ended_safely()
         flight.signal(signal.SIGKILL)

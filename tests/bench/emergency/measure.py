@@ -25,8 +25,9 @@ from msgspec import Struct
 
 from groundstation.authority import Authority
 from onboard.roster import Role
+from onboard.scheduling import prefer
 from tests.bench.emergency.messages import StationOptions, Stations, Vehicle, VehicleOptions
-from tests.bench.emergency.vehicle import NAME
+from tests.bench.emergency.vehicle import NAME, PRIORITY
 from tests.lossy_network import ADDRESSES, LossyNetwork, UnavailableError
 from tests.zenoh_sessions import free_port
 
@@ -117,6 +118,7 @@ def _loopback(name: str, trials: int, *, stuck: bool = False) -> Condition:
         stdout=subprocess.PIPE,
         text=True,
     ) as vehicle:
+        prefer(vehicle.pid, PRIORITY)
         _ready(vehicle)
         stations = subprocess.run(
             _command("stations", StationOptions(endpoint, trials)),

@@ -25,6 +25,7 @@ from msgspec.structs import replace
 
 from drivers.dynamixel import Dynamixel
 from drivers.dynamixel_settings import DynamixelSettings
+from drivers.mailbox import Notices
 from drivers.px4 import Px4, Px4Settings
 from drivers.samples import (
     AutopilotCommand,
@@ -44,6 +45,7 @@ from onboard.identity import load_identity
 from onboard.link import Asked, Link
 from onboard.link_settings import LinkSettings
 from onboard.roster import Roster
+from onboard.scheduling import ProcessParams, ask, prefer
 from onboard.wire import Ack, Stop
 from tests.bench.emergency.far_end import MARK
 from tests.bench.emergency.messages import Frames, Order, Vehicle, VehicleOptions
@@ -54,6 +56,8 @@ NAME = "x500"
 RAW_PUT, RAW_GET = f"pipewright/{NAME}/raw/put", f"pipewright/{NAME}/raw/get"
 #: Of the link, s: with the default of 2 s a connection through a bad network is given up again and again.
 LEASE = 10.0
+#: Real-time priority, as on the desk.
+PRIORITY = 10
 _PERIOD_NS = 4_000_000
 #: After the last order, until all is as before it, s.
 _RENEWED = 0.07
@@ -68,6 +72,7 @@ def far_end(what: str, frames: list[Frames]) -> Iterator[str]:
     """The other side of a driver, in a process of its own; gives where it is, and at the end what came there."""
     command = [sys.executable, "-m", "tests.bench.emergency.far_end", what]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        prefer(process.pid, PRIORITY + 2)  # hardware waits for no processor
         assert process.stdout is not None
         yield process.stdout.readline().strip()
         told, _ = process.communicate()
@@ -98,7 +103,7 @@ class Rig:
         Thread(target=self._renew, name="renew", daemon=True).start()
 
     def _new(self) -> Emergency:
-        emergency = Emergency(self._px4, self._bus, self._request, lambda: self.ticked_ns)
+        emergency = Emergency(self._px4, self._bus, self._request, lambda: self.ticked_ns, Notices())
         emergency.start()
         return emergency
 
@@ -148,6 +153,7 @@ class Rig:
 async def fly(options: VehicleOptions) -> Vehicle:
     """Until standard input closes."""
     frames: list[Frames] = []
+    ask(ProcessParams())
     with far_end("autopilot", frames) as port, far_end("servos", frames) as path:
         thrust = ThrustMap.of(load_config("desk").vehicle)
         px4 = Flying(Px4Settings(url=f"udpout://127.0.0.1:{port}"), thrust=thrust)
