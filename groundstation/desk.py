@@ -16,8 +16,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import IO
 
-from onboard.scheduling import prefer
-
 #: The first world on a machine compiles before it answers, s.
 WORLD_PATIENCE = 180.0
 #: A child that has been told to end gets this long, s.
@@ -110,6 +108,15 @@ def start(
     child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, text=True, process_group=0)
     prefer(child.pid, _PRIORITY[arguments[0]])
     return child
+
+
+def prefer(pid: int, priority: int) -> None:
+    """Let a process that was just started, and all threads that it will have, run before all ordinary ones.
+
+    Where the machine grants it (root, RLIMIT_RTPRIO): what else runs there is not what is measured.
+    """
+    with suppress(OSError):
+        os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def end(child: subprocess.Popen[str]) -> None:

@@ -25,7 +25,7 @@ from onboard.endpoints import LinkError, NoVehicleError, ZenohConfig, open_sessi
 from onboard.wire import Ack, Ask, Order, Outcome, Way, way_of
 
 #: Each stands still by itself, and costs a sign of life every 2.5 s.
-CONNECTIONS: Final = 5
+CONNECTIONS: Final = 8
 #: The vehicle keeps a silent one for so long, s: a packet that is lost three times is silent for five.
 _LEASE: Final = 10.0
 #: An order without an answer is sent again after this time, s, then after half as much more, up to ``AGAIN``. What
@@ -34,7 +34,7 @@ _SOON_AGAIN: Final = 0.04
 #: Then another connection is made beside those that there are, so many in all: after a cut they may sleep on for as
 #: long as it was; s. It is kept, since to close one that stands still can hold up the others.
 _SPARE: Final = 1.0
-_MOST: Final = 8
+_MOST: Final = 12
 #: One attempt to connect; a handshake with TLS may need that long where packets are lost, s.
 _ATTEMPT: Final = 5.0
 _REST: Final = 0.2

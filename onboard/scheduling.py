@@ -12,7 +12,6 @@ import os
 import resource
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from selectors import SelectSelector
 from types import TracebackType
@@ -106,15 +105,6 @@ def ask(params: ProcessParams) -> tuple[str, ...]:
         except OSError as error:
             refused.append(f"{what}: refused by the kernel ({error.strerror}); {remedy}")
     return tuple(refused)
-
-
-def prefer(pid: int, priority: int) -> None:
-    """Let a process that was just started, and all threads that it will have, run before all ordinary ones.
-
-    Where the machine grants it (root, RLIMIT_RTPRIO): what else runs there is not what is measured.
-    """
-    with suppress(OSError):
-        os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def _call(name: str, *arguments: int) -> None:

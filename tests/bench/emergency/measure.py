@@ -24,8 +24,8 @@ import msgspec
 from msgspec import Struct
 
 from groundstation.authority import Authority
+from groundstation.desk import prefer
 from onboard.roster import Role
-from onboard.scheduling import prefer
 from tests.bench.emergency.messages import StationOptions, Stations, Vehicle, VehicleOptions
 from tests.bench.emergency.vehicle import NAME, PRIORITY
 from tests.lossy_network import ADDRESSES, LossyNetwork, UnavailableError

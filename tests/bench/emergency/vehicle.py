@@ -37,6 +37,7 @@ from drivers.samples import (
     ServoCommand,
 )
 from drivers.thrust import ThrustMap
+from groundstation.desk import prefer
 from onboard.admission import vehicle_security
 from onboard.config import load_config
 from onboard.core.types import Request
@@ -45,7 +46,7 @@ from onboard.identity import load_identity
 from onboard.link import Asked, Link
 from onboard.link_settings import LinkSettings
 from onboard.roster import Roster
-from onboard.scheduling import ProcessParams, ask, prefer
+from onboard.scheduling import ProcessParams, ask
 from onboard.wire import Ack, Stop
 from tests.bench.emergency.far_end import MARK
 from tests.bench.emergency.messages import Frames, Order, Vehicle, VehicleOptions
