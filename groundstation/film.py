@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from math import cos, radians, sin
+from math import cos, degrees, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -145,17 +145,21 @@ class _Studio:
 
         from drivers.vehicle import Vehicle
         from sim_backend.bullet_scene import Scene
+        from sim_backend.deviations import DeviationParams, deviations
         from sim_backend.picture import Camera
 
         # A run's configuration was checked when it was flown.
-        vehicle = msgspec.convert(yaml.safe_load(run.config_yaml)["vehicle"], Vehicle)
+        config = yaml.safe_load(run.config_yaml)
+        vehicle = msgspec.convert(config["vehicle"], Vehicle)
         pipe = run.config.pipe
+        sizes = DeviationParams()
+        if run.truth is not None:
+            sizes = msgspec.convert(config.get("world", {}).get("deviations", {}), DeviationParams)
         self._left_on_pipe = run.truth is None or run.truth.sleeve_on_pipe
-        self._heading = pipe.heading_deg
-        self._pipe = pipe.position
+        self._pipe, self._heading = deviations(sizes, run.info.seed).pipe_pose(pipe.position, radians(pipe.heading_deg))
         self.size = (width, round(width * 9 / 16))
         self.scene: Scene = Scene(vehicle, bars=True)
-        self.scene.put_pipe(pipe.position, radians(pipe.heading_deg), pipe.radius, pipe.length)
+        self.scene.put_pipe(self._pipe, self._heading, pipe.radius, pipe.length)
         self._camera = Camera(self.scene, *self.size)
 
     def __enter__(self) -> _Studio:
@@ -179,7 +183,7 @@ class _Studio:
                 self.scene.release_sleeve(on_pipe=True)
             else:
                 self.scene.take_sleeve()
-        ahead = radians(self._heading)
+        ahead = self._heading
         gap = (self._pipe[0] - pose.position[0]) * cos(ahead) + (self._pipe[1] - pose.position[1]) * sin(ahead)
         # Near the pipe both fit into a narrow picture; far from it the vehicle is what counts.
         near = min(max((1.6 - gap) / 0.8, 0.0), 1.0)
@@ -189,7 +193,7 @@ class _Studio:
             pose.position[1] + lead * sin(ahead),
             pose.position[2] - 0.05,
         )
-        view = View(target, 1.8 - 0.6 * near, self._heading + 30.0 - 25.0 * near, -14.0 + 6.0 * near)
+        view = View(target, 1.8 - 0.6 * near, degrees(ahead) + 30.0 - 25.0 * near, -14.0 + 6.0 * near)
         picture = Image.fromarray(self._camera.take(view))
         draw = ImageDraw.Draw(picture)
         font = ImageFont.load_default(size=15)
