@@ -33,8 +33,9 @@ from sim_backend.servos import joint_torque, stop_torque, tool_servos
 Array = NDArray[np.float64]
 
 # What ``_drive`` tells for one step: force and moment on the base (W), torques on the joints of the chain (the sums of
-# what acts on the links beyond), where the base is, whether pipe or ground are near, and how the pipe grips there.
-_FORCE, _MOMENT, _TORQUE, _PLACE, _NEAR_PIPE, _NEAR_GROUND, _GRIP, _DRIVE_SIZE = 0, 3, 6, 9, 12, 13, 14, 15
+# what acts on the links beyond), where the base is, whether pipe or ground are near, how the pipe grips there, and
+# whether any of the airframe may be fast enough to break on the ground.
+_FORCE, _MOMENT, _TORQUE, _PLACE, _NEAR_PIPE, _NEAR_GROUND, _GRIP, _FAST, _DRIVE_SIZE = 0, 3, 6, 9, 12, 13, 14, 15, 16
 # What Bullet tells after it: place, attitude (x, y, z, w), velocity, rate (W), angles and rates of the chain's joints.
 _MOVED_SIZE = 19
 
@@ -86,6 +87,9 @@ def _drive(x: Array, p: Array, u: Array, out: Array, loops: bool) -> None:
     out[_NEAR_PIPE] = 1.0 if near else 0.0
     out[_GRIP] = grip(p, ahead, up, ry * nx - rx * ny) if near else 1.0
     out[_NEAR_GROUND] = 1.0 if x[at.POSITION + 2] < p[at.GROUND_REACH] + _NEAR else 0.0
+    speed = abs(x[at.VELOCITY]) + abs(x[at.VELOCITY + 1]) + abs(x[at.VELOCITY + 2])
+    turning = abs(x[at.RATE]) + abs(x[at.RATE + 1]) + abs(x[at.RATE + 2])
+    out[_FAST] = 1.0 if speed + turning * p[at.GROUND_REACH] > p[at.GROUND_CRASH_SPEED] else 0.0
 
 
 @compiled("(f8[::1], f8[::1], f8[::1], f8[::1])")
@@ -209,7 +213,7 @@ class PyBulletPlant(ArrayPlant):
         )  # fmt: skip
         world, torque = bullet.WORLD_FRAME, bullet.TORQUE_CONTROL
         self._hear()
-        for _ in range(steps):
+        for left in range(steps - 1, -1, -1):
             _drive(x, p, u, out, loops)
             told = out.tolist()
             push(body, -1, told[_FORCE:_MOMENT], told[_PLACE:_NEAR_PIPE], world, client)
@@ -220,17 +224,19 @@ class PyBulletPlant(ArrayPlant):
             velocity, rate = velocity_of(body, client)
             a, b, c = joints_of(body, chain, client)
             moved[:] = (*place, *attitude, *velocity, *rate, a[0], b[0], c[0], a[1], b[1], c[1])
-            near_ground = told[_NEAR_GROUND] != 0.0
-            before = x[at.VELOCITY : at.RATE + 3].tolist() if near_ground else None
+            # To ask for contacts is dear: after the last step, and whenever a touch may be a crash.
+            looks = told[_NEAR_GROUND] != 0.0 and (left == 0 or told[_FAST] != 0.0)
+            climb = float(x[at.VELOCITY + 2])
             _take(x, p, moved, self._centre)
             if told[_NEAR_PIPE] != 0.0 or x[at.CONTACT_FORCE] != 0.0:
                 self._feel_pipe(told[_GRIP])
             if x[at.PAYLOAD] != 0.0 and x[at.GRIPPER] > p[at.RELEASE_ANGLE]:
                 _let_go(x, p)
                 self._release()
-            x[at.ON_GROUND] = 0.0
-            if before is not None:
-                self._feel_ground(before)
+            if looks:
+                self._feel_ground(climb)
+            elif left == 0:
+                x[at.ON_GROUND] = 0.0
         _settle(x, p)
         self._known_x[:] = x[: at.ACCELERATION]
 
@@ -295,13 +301,14 @@ class PyBulletPlant(ArrayPlant):
             x[at.TIP_SLIP] += speed * p[at.STEP]
         scene.set_friction(grip * p[at.CONTACT_KINETIC if sliding else at.CONTACT_STATIC])
 
-    def _feel_ground(self, before: list[float]) -> None:
+    def _feel_ground(self, climb: float) -> None:
         """Note whether anything touches the ground, and whether the airframe has hit it too hard.
 
-        ``before`` are velocity, attitude and rate at the start of the step.
+        ``climb`` is the velocity upwards at the start of the step, m/s.
         """
         x, p, scene = self.x, self.p, self.scene
         frame = False
+        x[at.ON_GROUND] = 0.0
         for point in self._bullet.getContactPoints(scene.vehicle, scene.ground, physicsClientId=scene.client):
             if point[9] <= 0.0:
                 continue
@@ -311,8 +318,8 @@ class PyBulletPlant(ArrayPlant):
             frame = True
             if not self._frame_on_ground and x[at.CRASH] == 0.0:
                 w = self._moved[10:13]
-                arm_x, arm_y = point[5][0] - self._moved[0], point[5][1] - self._moved[1]
-                speed = -(before[2] + float(w[0]) * arm_y - float(w[1]) * arm_x)
+                arm_x, arm_y = point[5][0] - float(x[at.POSITION]), point[5][1] - float(x[at.POSITION + 1])
+                speed = -(climb + float(w[0]) * arm_y - float(w[1]) * arm_x)
                 if speed > p[at.GROUND_CRASH_SPEED]:
                     x[at.CRASH] = 1.0
                     x[at.CRASH_VALUE] = speed

@@ -26,7 +26,7 @@ LIMIT = 13.0
 
 @pytest.fixture(scope="module")
 def p(vehicle: Vehicle) -> Array:
-    p = constants(vehicle, PlantParams(), 1e-4, PIPE, 0.0, RADIUS, 2.0)
+    p = constants(vehicle, PlantParams(), PIPE, 0.0, RADIUS, 2.0)
     put_loops(p, vehicle, LoopParams(), 1e-4)
     return p
 

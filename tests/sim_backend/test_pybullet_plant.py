@@ -51,10 +51,10 @@ def test_it_stands_as_the_other_does(vehicle: Vehicle) -> None:
 def test_both_fall_alike(vehicle: Vehicle, off: bool) -> None:
     """Turning, the arm flung; as modelled, or with mass, centre and inertia off and play in the gears, in wind."""
     truth = deviations(DeviationParams(mass=0.03, centre=0.005, inertia=0.1) if off else DeviationParams(), 1)
-    play = {"backlash": 0.0044, "rotor_drag": 8e-5} if off else {}
+    params = PlantParams(backlash=0.0044, rotor_drag=8e-5) if off else PlantParams()
     found = []
     for kind, plant_type in ((PlantKind.RIGID, RigidBody), (PlantKind.PYBULLET, PyBulletPlant)):
-        plant = plant_type(vehicle, PlantParams(kind=kind, **play), PIPE, 0.0, RADIUS, 2.0, truth)
+        plant = plant_type(vehicle, replace(params, kind=kind), PIPE, 0.0, RADIUS, 2.0, truth)
         plant.x[at.POSITION + 2] = 10.0
         plant.x[at.RATE : at.RATE + 3] = (0.4, -0.6, 0.3)
         plant.x[at.JOINT_RATE : at.JOINT_RATE + 3] = (1.0, -0.5, 0.8)
@@ -124,7 +124,7 @@ def test_both_press_alike_and_leave_the_sleeve(vehicle: Vehicle, at_pipe: Hand) 
 
 def weight(plant: PyBulletPlant) -> float:
     b, client, body = plant.scene.bullet, plant.scene.client, plant.scene.vehicle
-    return sum(b.getDynamicsInfo(body, link, client)[0] for link in range(-1, b.getNumJoints(body, client)))
+    return float(sum(b.getDynamicsInfo(body, link, client)[0] for link in range(-1, b.getNumJoints(body, client))))
 
 
 def test_a_sleeve_let_go_in_the_air_falls(at_pipe: Hand) -> None:

@@ -22,7 +22,7 @@ class Bench:
     """One joint servo on a bench."""
 
     def __init__(self, vehicle: Vehicle, *, ideal: bool = True) -> None:
-        self.p = constants(vehicle, PlantParams(ideal_servos=ideal), 1e-4, PIPE, 0.0, RADIUS, 2.0)
+        self.p = constants(vehicle, PlantParams(ideal_servos=ideal), PIPE, 0.0, RADIUS, 2.0)
         self.x, self.u = np.zeros(at.STATE_SIZE), np.zeros(at.DRIVE_SIZE)
         self.u[at.U_TORQUE_ON] = 1.0
         self.u[at.U_CURRENT_LIMIT] = STALL_CURRENT
