@@ -39,7 +39,7 @@ from sim_backend.world_link import WorldServer
 #: After which the thread of one emulator hands the interpreter to another's, s: each answers within milliseconds.
 SWITCH_INTERVAL = 0.0005
 #: The same beside PyBullet, which does not let go of the interpreter while it computes.
-BUSY_SWITCH_INTERVAL = 0.00005
+BUSY_SWITCH_INTERVAL = 0.0002
 #: A flight process that is left alone lands first; the world stays for it, but not longer, s.
 LAST_FLIGHT = 150.0
 _GLANCE = 0.05
