@@ -28,6 +28,7 @@ from groundstation import (
     orders,
     params,
     preflight,
+    recompute,
     status,
     watch,
 )
@@ -168,7 +169,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
     of_vehicle = (status, watch, estop, preflight, lease, orders, events, params, logs)
-    for group in (*of_vehicle, calibrate, keys, completion, film):
+    for group in (*of_vehicle, recompute, calibrate, keys, completion, film):
         group.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")

@@ -9,7 +9,7 @@ import numpy as np
 
 from groundstation import punctuality
 from groundstation.metrics import phases, plane, windows
-from groundstation.run import Array, Mask, Run
+from groundstation.run import ESTIMATORS, Array, Mask, Run
 from groundstation.svg import Chart, Range, ticks
 from onboard.messages import Phase
 
@@ -76,6 +76,18 @@ def estimation(run: Run) -> list[Chart]:
     span = windows(run).contact
     error.line(t[span], (run.force_est - run.truth.force)[span], "", "c1")
     return [both, _contact(run, error)]
+
+
+def estimators(run: Run) -> list[Chart]:
+    """What each force estimator reads, about the contact."""
+    if not run.forces:
+        return []
+    chart = _contact(run, Chart("compression by each estimator", "N", around_contact(run), width=950))
+    if run.truth is not None:
+        chart.line(run.t, run.truth.force, "measured", "c2 broad")
+    for name, style in zip(ESTIMATORS, ("c1", "c3", "c4", "ref"), strict=True):
+        chart.line(run.t, run.forces[name], name, style)
+    return [chart]
 
 
 def actuation(run: Run) -> list[Chart]:

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from groundstation import health
+from groundstation import estimators, health
 from groundstation.punctuality import timing
 from groundstation.run import Array, Mask, Run
 from onboard.messages import Phase
@@ -58,7 +58,8 @@ class Windows:
 def compute(run: Run, wall_s: float | None = None) -> dict[str, Any]:
     """Content of ``metrics.json``: N, m, s, deg, N m. ``None`` stands for what the run did not come to or cannot tell.
 
-    wall_s: how long the run took on the wall clock, where that is known.
+    wall_s: how long the run took on the wall clock, where that is known. What a tick of the estimators costs is read
+    from beside the log.
     """
     window = windows(run)
     return {
@@ -73,6 +74,7 @@ def compute(run: Run, wall_s: float | None = None) -> dict[str, Any]:
         "phases": phases(run),
         "force_rmse": _force_rmse(run, window.contact),
         "state_rmse": {"flight": _state_rmse(run, window.flight), "contact": _state_rmse(run, window.contact)},
+        "estimators": estimators.compute(run, window.contact, estimators.read_costs(run.path)),
         "contact": _contact(run, window),
         "limits": _limits(run),
         "adhesive": _adhesive(run),

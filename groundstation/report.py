@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from groundstation import figures, film, health, punctuality, table
+from groundstation import estimators, figures, film, health, punctuality, table
 from groundstation.run import Run
 from groundstation.svg import Chart
 from onboard.messages import Severity
@@ -48,6 +48,7 @@ def _page(run: Run, metrics: dict[str, Any], beside: Sequence[dict[str, Any]]) -
     yield from _figure(
         "Force estimate (figure 6)", "Compression of the pipe is positive.", figures.estimation(run), pair=False
     )
+    yield from _estimators(run, metrics)
     note = "What the rotors and the servos really gave, over the whole run."
     yield from _figure("Actuation (figure 7)", note, figures.actuation(run), pair=False)
     note = "The drawing is to scale, with the vehicle to the left; the broken circle is the needle's path."
@@ -113,6 +114,18 @@ def _table(metrics: dict[str, Any], beside: Sequence[dict[str, Any]]) -> Iterato
         )
         values = (rows[i].value for rows in others)
         yield "".join(f'<td class="n">{v:.5f}</td>' if v is not None else "<td></td>" for v in values) + "</tr>"
+    yield "</table></div>"
+
+
+def _estimators(run: Run, metrics: dict[str, Any]) -> Iterator[str]:
+    told = metrics["estimators"]
+    if told is None:
+        return
+    yield from _figure("Force estimators, side by side", estimators.words(told), figures.estimators(run), pair=False)
+    yield '<div class="scroll"><table><tr><th></th>'
+    yield "".join(f'<th class="n">{heading}</th>' for heading in estimators.HEADINGS) + "</tr>"
+    for label, cells in estimators.rows(told):
+        yield f"<tr><td>{escape(label)}</td>" + "".join(f'<td class="n">{cell}</td>' for cell in cells) + "</tr>"
     yield "</table></div>"
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
@@ -73,15 +74,30 @@ class _Inputs(Struct, gc=False):
     link: _Link = _Link()
 
 
+class _Force(Struct, frozen=True, gc=False):
+    contact: float = 0.0
+
+
+class _Forces(Struct, frozen=True, gc=False):
+    paper: _Force = _Force()
+    body: _Force = _Force()
+    momentum: _Force = _Force()
+    kalman: _Force = _Force()
+    felt: float = 0.0
+    alarm: bool = False
+
+
 class _Estimate(Struct, gc=False):
     p_WB: Three
     rpy: Three
     joints: Three
     contact_force: float
+    in_contact: bool
     payload: bool
     age_odometry: float
     age_autopilot: float
     age_servos: float
+    forces: _Forces | None = None
 
 
 class _Reference(Struct, gc=False):
@@ -154,6 +170,10 @@ class _World(Struct, frozen=True):
     plant: _Plant = _Plant()
 
 
+class _Estimators(Struct, frozen=True):
+    selected: str = "paper"
+
+
 class RunConfig(Struct):
     """The parameters that figures of merit are measured against."""
 
@@ -162,6 +182,7 @@ class RunConfig(Struct):
     plan: _Plan
     vehicle: _Vehicle
     world: _World = _World()
+    estimators: _Estimators = _Estimators()
 
 
 class _Revision(Struct):
@@ -248,6 +269,12 @@ class Run:
     """What the loop follows, (n, 3)."""
     force_des: Array
     force_est: Array
+    forces: dict[str, Array]
+    """Compression by each estimator, (n,) each, and by the joints alone (``FELT``); empty when none was recorded."""
+    triggered: Mask
+    """The contact trigger is pulled."""
+    alarm: Mask
+    """It would have been, away from the pipe, had the tip been at the crack."""
     dispensing: Mask
     payload: Mask
     stamps: dict[str, Array]
@@ -271,13 +298,20 @@ class Run:
     """In order of their times."""
     start_ns: int = 0
 
+    def with_estimates(self, forces: dict[str, Array], triggered: Mask, alarm: Mask, selected: str) -> Run:
+        """The same run with other estimates of the contact force, the ``selected`` one being believed."""
+        config = msgspec.structs.replace(self.config, estimators=_Estimators(selected))
+        return replace(self, forces=forces, triggered=triggered, alarm=alarm, config=config)
+
     def where(self, *phases: str) -> Mask:
         """Ticks in any of these phases."""
         return np.isin(self.phase, phases)
 
 
 SOURCES = ("odometry", "autopilot", "servos")
-_NO_SERVOS, _NO_POSE, _NO_ATTITUDE = ((float("nan"),) * count for count in (10, 6, 4))
+ESTIMATORS = ("paper", "body", "momentum", "kalman")
+FELT = "felt"
+_NO_SERVOS, _NO_POSE, _NO_ATTITUDE, _NO_FORCES = ((float("nan"),) * count for count in (10, 6, 4, 6))
 #: An older truth says nothing of a tick, s.
 TRUTH_LASTS = 0.05
 
@@ -345,6 +379,8 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
                     *(_NO_ATTITUDE if autopilot is None else autopilot.q_WB),
                     (inputs.t_ns - inputs.link.heard_ns) * 1e-9 if inputs.link.commander else nowhere,
                     inputs.link.present,
+                    estimate.in_contact,
+                    *_read_forces(estimate.forces),
                 )
                 if (name := inputs.link.commander) and name not in commanders[-1:]:
                     commanders.append(name)
@@ -396,6 +432,9 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
             joints_ref=rows[:, 17:20],
             force_des=rows[:, 20],
             force_est=rows[:, 21],
+            forces={} if np.isnan(rows[:, 64]).all() else dict(zip((*ESTIMATORS, FELT), rows[:, 64:69].T, strict=True)),
+            triggered=rows[:, 63] > 0,
+            alarm=rows[:, 69] > 0,
             dispensing=rows[:, 22] > 0,
             payload=rows[:, 23] > 0,
             stamps=dict(zip(SOURCES, rows[:, 24:27].T, strict=True)),
@@ -424,6 +463,14 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
             events=sorted(events, key=lambda event: event.t_ns),
             start_ns=start_ns,
         )
+
+
+def _read_forces(told: _Forces | None) -> tuple[float, ...]:
+    if told is None:
+        return _NO_FORCES
+    return (
+        told.paper.contact, told.body.contact, told.momentum.contact, told.kalman.contact, told.felt, told.alarm
+    )  # fmt: skip
 
 
 def _by_tick(index: NDArray[np.int64], timings: list[Timing]) -> Array:

@@ -10,7 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from groundstation import table
+from groundstation import estimators, table
 from groundstation.run import Run
 from onboard.messages import Severity
 
@@ -54,11 +54,31 @@ def summarize(
         verdict = f"{_MARKS[row.better]} {row.verdict}"
         side.add_row(row.label, f"{row.paper:.4f}", value, contact, row.unit, verdict, *rest, end_section=i == 2)
     console.print(side)
+    if metrics["estimators"] is not None:
+        console.print(side_by_side(metrics["estimators"]))
+        console.print(estimators.words(metrics["estimators"]) + "\n", markup=False)
     others = Table(box=None, show_header=False, pad_edge=False)
     for figure in table.figures(metrics, run.config.repair.force):
         others.add_row(figure.label, figure.value, _MARKS[figure.good], figure.detail)
     console.print(others)
     console.print(f"\nreport: {report}", soft_wrap=True, highlight=False)
+
+
+def side_by_side(told: dict[str, Any]) -> Table:
+    """The table of the force estimators."""
+    side = Table(
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+        title="Force estimators, from trigger to release",
+        title_justify="left",
+    )
+    side.add_column("")
+    for heading in estimators.HEADINGS:
+        side.add_column(heading, justify="right")
+    for label, cells in estimators.rows(told):
+        side.add_row(label, *cells)
+    return side
 
 
 def _reasons(run: Run, console: Console) -> None:

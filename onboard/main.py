@@ -112,6 +112,13 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("--from", type=float, dest="start", metavar="SECONDS")
     replay.add_argument("--partial", action="store_true")
     replay.set_defaults(run=_replay)
+    words = "run the force estimators over a log again; writes JSON to standard output"
+    estimators = commands.add_parser("estimators", help=words)
+    estimators.add_argument("log", type=Path)
+    estimators.add_argument("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE")
+    estimators.add_argument("--ukf", action="store_true")
+    estimators.add_argument("--partial", action="store_true")
+    estimators.set_defaults(run=_estimators)
     return parser
 
 
@@ -126,6 +133,7 @@ def _folder(config: Config, out: Path) -> Path:
 
 
 def _sim(options: argparse.Namespace) -> int:
+    from onboard import estimator_cost
     from onboard.core.derived import check_mission
     from onboard.simulate import simulate
 
@@ -139,10 +147,12 @@ def _sim(options: argparse.Namespace) -> int:
         simulate(config, log, progress)
     finally:
         progress.close()
+    estimator_cost.write(config, log)
     return 0
 
 
 def _fly(options: argparse.Namespace) -> int:
+    from onboard import estimator_cost
     from onboard.core.derived import check_mission
     from onboard.devices import check_devices
     from onboard.fly import Options, fly
@@ -172,6 +182,8 @@ def _fly(options: argparse.Namespace) -> int:
             flown = runner.run(fly(config, lambda: _folder(config, options.out), how, load, save, progress, say))
     finally:
         progress.close()
+    if (options.out / "log.mcap").is_file():
+        estimator_cost.write(config, options.out / "log.mcap")
     return 0 if flown else INTERRUPTED
 
 
@@ -194,3 +206,18 @@ def _replay(options: argparse.Namespace) -> int:
         return WRONG_INPUT
     print(result)
     return 0 if result.same else 1
+
+
+def _estimators(options: argparse.Namespace) -> int:
+    import msgspec
+
+    from onboard.logfile import LogError
+    from onboard.recompute import recompute
+
+    try:
+        result = recompute(options.log, options.sets, ukf=options.ukf, partial=options.partial)
+    except LogError as error:
+        print(error, file=sys.stderr)
+        return WRONG_INPUT
+    sys.stdout.buffer.write(msgspec.json.encode(result))
+    return 0

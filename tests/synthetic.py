@@ -27,6 +27,8 @@ from onboard.core.types import (
     Control,
     Estimate,
     Event,
+    Force,
+    Forces,
     Inputs,
     Outputs,
     Phase,
@@ -49,6 +51,7 @@ PITCH_ERROR = math.radians(0.02)
 JOINT_ERROR = math.radians(0.1)
 MEASURED_ERROR = 0.04
 ESTIMATED_ERROR = 0.01
+KALMAN_ERROR = -0.005
 NEEDLE_ERROR = 0.0005
 
 PHASES: tuple[tuple[Phase, float], ...] = (
@@ -179,6 +182,13 @@ def _cycle(index: int, phase: Phase, phase_time: float, share: float) -> tuple[T
         age_autopilot=0.0,
         age_servos=0.0,
         valid=True,
+        forces=Forces(
+            paper=Force((0.0, 0.0, 0.0), estimated),
+            body=Force((0.0, 0.0, 0.0), estimated),
+            momentum=Force((0.0, 0.0, 0.0), estimated),
+            kalman=Force((0.0, 0.0, 0.0), measured + KALMAN_ERROR if pressing else 0.0),
+            felt=measured,
+        ),
     )
     reference = Reference(
         p=p,

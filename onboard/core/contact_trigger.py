@@ -3,6 +3,10 @@
 Contact is lost when next to no force is left for ``lost_time``; or, while a larger force is asked for, when the
 estimate falls far short of it: then the push goes into nothing and moves the vehicle towards the pipe, so that is
 told at once.
+
+A gust at the crack is force at the crack. Two more witnesses tell it from contact, each asked for by a parameter: what
+the joints feel at the tip, where no wind acts (``felt``), and the onset: a contact rises in tenths of a second above
+what was read before, a gust in seconds.
 """
 
 from __future__ import annotations
@@ -25,6 +29,9 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     short_share: Annotated[float, spec("1", 0.0, 0.9, "share of the desired force that is far too little")] = 0.4
     short_force: Annotated[float, spec("N", 0.1, 5.0, "desired force from which that counts")] = 0.8
     short_time: Annotated[float, spec("s", 0.0, 5.0, "how long it must be too little")] = 0.08
+    felt: Annotated[float, spec("N", 0.0, 3.0, "compression by the joints' currents that means contact; 0: any")] = 0.0
+    onset: Annotated[float, spec("N", 0.0, 3.0, "rise of the estimate that means contact; 0: any")] = 0.0
+    onset_time: Annotated[float, spec("s", 0.05, 10.0, "time in which that rise is to be seen")] = 1.0
 
 
 class State(Struct, frozen=True, gc=False):
@@ -32,18 +39,32 @@ class State(Struct, frozen=True, gc=False):
 
     contact: bool = False
     time: float = 0.0
+    before: float | None = None
+    """Slow mean of the estimate before the contact, N; None before the first tick."""
 
 
-def step(state: State, distance: float, force: float, desired: float, params: Params, dt: float) -> State:
-    """One tick; ``distance`` of the tip from the crack (m), ``force`` estimated and ``desired`` compression (N)."""
+def step(state: State, distance: float, force: float, felt: float, desired: float, params: Params, dt: float) -> State:
+    """One tick.
+
+    distance: of the tip from the crack, m. force, felt, desired: compression as estimated, as felt by the joints, as
+    wanted, N.
+    """
+    before = force if state.before is None else state.before
     if state.contact:
         short = desired >= params.short_force and force < params.short_share * desired
         against = short or force < params.lost_force or distance > 2.0 * params.tolerance
         limit = params.short_time if short else params.lost_time
     else:
-        against = force > params.threshold and distance < params.tolerance
+        against = (
+            force > params.threshold
+            and distance < params.tolerance
+            and (params.felt == 0.0 or felt > params.felt)
+            and (params.onset == 0.0 or force - before > params.onset)
+        )
         limit = params.debounce
+        if not against:
+            before += (force - before) * dt / (params.onset_time + dt)
     if not against:
-        return state if state.time == 0.0 else State(state.contact, 0.0)
+        return State(state.contact, 0.0, before)
     time = state.time + dt
-    return State(not state.contact, 0.0) if time >= limit else State(state.contact, time)
+    return State(not state.contact, 0.0, before) if time >= limit else State(state.contact, time, before)

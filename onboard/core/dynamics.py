@@ -22,6 +22,7 @@ from drivers.vehicle import Carrier, Part, Vehicle
 from onboard.core.compiled import compiled
 
 Nine = tuple[float, float, float, float, float, float, float, float, float]
+Four = tuple[float, float, float, float]
 Array = NDArray[np.float64]
 
 _CARRIERS = (Carrier.BASE, Carrier.LINK_1, Carrier.LINK_2, Carrier.TOOL)
@@ -56,6 +57,15 @@ class Model:
         """M qdd + C qd + G: the generalised forces that give this acceleration."""
         variant = self._variants[payload]
         return _inverse_dynamics(q, qd, qdd, variant.parts, variant.turning)
+
+    def momentum(self, q: Nine, qd: Nine, payload: bool) -> tuple[Nine, Nine]:
+        """Generalised momentum p = M qd, and C^T qd - G: what p' is beside the generalised forces."""
+        return momentum(q, qd, *self.packed(payload))
+
+    def packed(self, payload: bool) -> tuple[Array, Array]:
+        """What the kernels are told of the vehicle: ``parts`` and ``turning``."""
+        variant = self._variants[payload]
+        return variant.parts, variant.turning
 
     def contact_torque(self, q: Nine, force_W: Vec3) -> Nine:
         """J_tip^T F: generalised forces of a force (N, W) that acts on the gripper's tip."""
@@ -311,3 +321,101 @@ def _mass_and_coriolis(q: Nine, qd: Nine, parts: Array, turning: Array) -> tuple
     for i in range(6, 9):
         mass[i, i] += turning[4, 0]
     return mass, coriolis
+
+
+@compiled("UniTuple(f8, 4)(f8, f8, f8, f8, f8, f8, f8[::1])")
+def _spin(wx: float, wy: float, wz: float, c: float, s: float, rate: float, inertia: Array) -> Four:
+    """I w in B, of a part that turns as in ``_turning_torque``; and the gradient of its energy along its angle."""
+    px, py, pz = c * wx + s * wz, wy - rate, c * wz - s * wx
+    nx, ny, nz = inertia[0] * px, inertia[1] * py, inertia[2] * pz
+    return c * nx - s * nz, ny, s * nx + c * nz, nx * pz - nz * px
+
+
+@compiled("UniTuple(UniTuple(f8, 9), 2)(UniTuple(f8, 9), UniTuple(f8, 9), f8[:, ::1], f8[:, ::1])")
+def momentum(q: Nine, qd: Nine, parts: Array, turning: Array) -> tuple[Nine, Nine]:
+    """``Model.momentum``, for kernels: the gradients of the Lagrangian along qd and along q.
+
+    By sums over the parts, without the matrices.
+    """
+    cf, sf, ct, st, cp, sp = cos(q[3]), sin(q[3]), cos(q[4]), sin(q[4]), cos(q[5]), sin(q[5])
+    r11, r12, r13 = cp * ct, cp * st * sf - sp * cf, cp * st * cf + sp * sf
+    r21, r22, r23 = sp * ct, sp * st * sf + cp * cf, sp * st * cf - cp * sf
+    r31, r32, r33 = -st, ct * sf, ct * cf
+    vx = r11 * qd[0] + r21 * qd[1] + r31 * qd[2]
+    vy = r12 * qd[0] + r22 * qd[1] + r32 * qd[2]
+    vz = r13 * qd[0] + r23 * qd[1] + r33 * qd[2]
+    fd, td, pd = qd[3], qd[4], qd[5]
+    wx, wy, wz = fd - st * pd, cf * td + sf * ct * pd, cf * ct * pd - sf * td
+    c1, s1, c2, s2, c3, s3 = cos(q[6]), sin(q[6]), cos(q[7]), sin(q[7]), cos(q[8]), sin(q[8])
+    v1, v2, v3 = qd[6], qd[7], qd[8]
+    g = turning[4, 1]
+    gx, gy, gz = g * r31, g * r32, g * r33
+
+    # Momentum and angular momentum (B), first moment, and for each joint what turns with it.
+    px = py = pz = lx = ly = lz = sx = sy = sz = 0.0
+    p1 = p2 = p3 = d1 = d2 = d3 = 0.0
+    for k in range(parts.shape[0]):
+        m, a1, a2, a3 = parts[k, 0], parts[k, 4], parts[k, 5], parts[k, 6]
+        rx = parts[k, 1] + a1 * c1 + a2 * c2 + a3 * c3
+        ry = parts[k, 2]
+        rz = parts[k, 3] + a1 * s1 + a2 * s2 + a3 * s3
+        mx = m * (vx + wy * rz - wz * ry - a1 * s1 * v1 - a2 * s2 * v2 - a3 * s3 * v3)
+        my = m * (vy + wz * rx - wx * rz)
+        mz = m * (vz + wx * ry - wy * rx + a1 * c1 * v1 + a2 * c2 * v2 + a3 * c3 * v3)
+        px += mx
+        py += my
+        pz += mz
+        lx += ry * mz - rz * my
+        ly += rz * mx - rx * mz
+        lz += rx * my - ry * mx
+        sx += m * rx
+        sy += m * ry
+        sz += m * rz
+        # along u'(theta), and along w x u' + u'' theta' less gravity
+        p1 += a1 * (c1 * mz - s1 * mx)
+        p2 += a2 * (c2 * mz - s2 * mx)
+        p3 += a3 * (c3 * mz - s3 * mx)
+        d1 += a1 * (c1 * (wy - v1) * mx + (wz * -s1 - wx * c1) * my + s1 * (wy - v1) * mz + m * (s1 * gx - c1 * gz))
+        d2 += a2 * (c2 * (wy - v2) * mx + (wz * -s2 - wx * c2) * my + s2 * (wy - v2) * mz + m * (s2 * gx - c2 * gz))
+        d3 += a3 * (c3 * (wy - v3) * mx + (wz * -s3 - wx * c3) * my + s3 * (wy - v3) * mz + m * (s3 * gx - c3 * gz))
+
+    n0 = _spin(wx, wy, wz, 1.0, 0.0, 0.0, turning[0])
+    n1 = _spin(wx, wy, wz, c1, s1, v1, turning[1])
+    n2 = _spin(wx, wy, wz, c2, s2, v2, turning[2])
+    n3 = _spin(wx, wy, wz, c3, s3, v3, turning[3])
+    lx += n0[0] + n1[0] + n2[0] + n3[0]
+    ly += n0[1] + n1[1] + n2[1] + n3[1]
+    lz += n0[2] + n1[2] + n2[2] + n3[2]
+
+    # A turn of the body about e leaves e x (..) of all that is fixed in W: velocity of the origin, and gravity.
+    ex = py * vz - pz * vy + sz * gy - sy * gz
+    ey = pz * vx - px * vz + sx * gz - sz * gx
+    ez = px * vy - py * vx + sy * gx - sx * gy
+    rotor = turning[4, 0]
+    total = 0.0
+    for k in range(parts.shape[0]):
+        total += parts[k, 0]
+    return (
+        (
+            r11 * px + r12 * py + r13 * pz,
+            r21 * px + r22 * py + r23 * pz,
+            r31 * px + r32 * py + r33 * pz,
+            lx,
+            cf * ly - sf * lz,
+            ct * (sf * ly + cf * lz) - st * lx,
+            p1 - n1[1] + rotor * v1,
+            p2 - n2[1] + rotor * v2,
+            p3 - n3[1] + rotor * v3,
+        ),
+        (
+            0.0,
+            0.0,
+            -g * total,
+            ex + ly * wz - lz * wy,
+            cf * ey - sf * ez - pd * (ct * lx + st * (sf * ly + cf * lz)),
+            ct * (sf * ey + cf * ez) - st * ex,
+            d1 + n1[3],
+            d2 + n2[3],
+            d3 + n3[3],
+        ),
+    )

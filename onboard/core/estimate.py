@@ -11,9 +11,10 @@ from math import acos, hypot, inf
 from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from drivers.samples import AutopilotState, Odometry, ServoState, Vec3
-from onboard.core import contact_trigger, kinematics, math3, observer
+from onboard.core import contact_trigger, estimators, kinematics, math3
 from onboard.core.derived import Derived
 from onboard.core.guidance import Progress
 from onboard.core.kinematics import Tool
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 NEAR_PIPE = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE)
 ON_GROUND = (Phase.PREFLIGHT, Phase.ARMED, Phase.STOPPED)
+FREE_FLIGHT = (Phase.APPROACH, Phase.ALIGN, Phase.ADHESIVE, Phase.TOOL_CHANGE, Phase.TARE, Phase.RETURN, Phase.HOLD)
 
 
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,12 +41,12 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class State(Struct, frozen=True, gc=False):
-    """The newest usable samples, and the states of the observer and of the trigger."""
+    """The newest usable samples, and the states of the estimators and of the trigger."""
 
     odometry: Odometry | None = None
     autopilot: AutopilotState | None = None
     servos: ServoState | None = None
-    observer: observer.State = observer.State()
+    forces: estimators.State = estimators.State()
     trigger: contact_trigger.State = contact_trigger.State()
     payload: bool = True
     finite: bool = True
@@ -57,6 +59,8 @@ class State(Struct, frozen=True, gc=False):
     """Angle between the verticals of odometry and autopilot, rad."""
     shift: Vec3 = (0.0, 0.0, 0.0)
     """What takes a position of the tracker back into the frame it had before it jumped, m."""
+    alarm: contact_trigger.State = contact_trigger.State()
+    """Away from the pipe: the trigger, as if the tip were at the crack."""
 
 
 def step(
@@ -65,12 +69,12 @@ def step(
     phase: Phase,
     progress: Progress,
     reference: Reference | None,
-    thrust: float,
+    command: estimators.Command,
     derived: Derived,
     params: AllParams,
     dt: float,
 ) -> tuple[State, Estimate]:
-    """One tick. phase, progress, reference, thrust: of the tick before."""
+    """One tick. phase, progress, reference, command: of the tick before."""
     finite = True
     jump, reset, disagreement = 0.0, False, state.disagreement
     odometry, autopilot, servos = state.odometry, state.autopilot, state.servos
@@ -111,8 +115,8 @@ def step(
     if odometry is None or autopilot is None or servos is None:
         estimate = _nothing(state.payload, ages)
         waiting = State(
-            odometry, autopilot, servos, state.observer, state.trigger, state.payload,
-            finite, jump, reset, disagreement, shift,
+            odometry, autopilot, servos, state.forces, state.trigger, state.payload,
+            finite, jump, reset, disagreement, shift, state.alarm,
         )  # fmt: skip
         return waiting, estimate
 
@@ -135,41 +139,46 @@ def step(
         state.payload and not (phase is Phase.RELEASE and servos.position[4] > params.estimate.released_at)
     )
 
-    desired = reference.a if reference is not None else (0.0, 0.0, 0.0)
-    watched = observer.step(
-        state.observer, acceleration, desired, thrust, (R[2], R[5], R[8]), derived.model.mass(payload), vehicle.gravity,
-        params.observer, dt,
-    )  # fmt: skip
-    if progress.taring:
-        watched = observer.accumulate(watched, R)
-        if progress.tared:
-            watched = observer.finish_tare(watched)
-    elif watched.count and not progress.tare_begun:
-        watched = observer.drop_tare(watched)
-    force = observer.external_force(watched, R, params.observer)
-    n = site.normal
-    compression = -(force[0] * n[0] + force[1] * n[1])
-
     tip = kinematics.tip_W(vehicle.arm, p, R, joints, Tool.NEEDLE if phase is Phase.ADHESIVE else Tool.GRIPPER)
-    trigger = state.trigger
-    if phase in NEAR_PIPE:
-        crack = site.crack
-        distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
+    at_pipe, crack = phase in NEAR_PIPE, site.crack
+    distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
+    rpy_rate = math3.euler_rates_from_body(rpy, w)
+    sight = estimators.Sight(
+        autopilot.f_B, acceleration, v, ahead, odometry is not state.odometry, R, p, rpy, rpy_rate, servos, ages[2],
+        payload, reference.a if reference is not None else _O, at_pipe and distance < params.estimators.gate,
+        progress.arrived and not at_pipe,
+    )  # fmt: skip
+    dropped = not progress.tare_begun
+    watched, forces = estimators.step(
+        state.forces, sight, command, progress.taring, progress.tared, dropped, derived, params, dt
+    )
+    chosen = estimators.selected(forces, params.estimators)
+    force, compression = chosen.force_W, chosen.contact
+
+    trigger, alarm = state.trigger, state.alarm
+    if at_pipe:
         asked = reference.force if reference is not None and reference.pressing else 0.0
-        trigger = contact_trigger.step(trigger, distance, compression, asked, params.contact, dt)
-    elif trigger.contact or trigger.time:
-        trigger = contact_trigger.State()
+        trigger = contact_trigger.step(trigger, distance, compression, forces.felt, asked, params.contact, dt)
+        alarm = _QUIET
+    else:
+        trigger = _QUIET
+        if phase in FREE_FLIGHT:
+            alarm = contact_trigger.step(alarm, 0.0, compression, forces.felt, 0.0, params.contact, dt)
+        else:
+            alarm = _QUIET
+    if alarm.contact:
+        forces = replace(forces, alarm=True)
 
     estimate = Estimate(
-        p, v, rpy, math3.euler_rates_from_body(rpy, w), R, w, acceleration, joints, rates, tip, force,
+        p, v, rpy, rpy_rate, R, w, acceleration, joints, rates, tip, force,
         math3.rotate_transposed(kinematics.tool_rotation(joints[2]), math3.rotate_transposed(R, force)),
-        compression, trigger.contact, payload, ages[0], ages[1], ages[2], True,
+        compression, trigger.contact, payload, ages[0], ages[1], ages[2], True, forces,
     )  # fmt: skip
     if state.odometry is None or odometry.t_ns != state.odometry.t_ns:
         x, y, z = math3.vertical(odometry.q_WB)
         disagreement = acos(min(1.0, max(-1.0, x * R[6] + y * R[7] + z * R[8])))
     return State(
-        odometry, autopilot, servos, watched, trigger, payload, finite, jump, reset, disagreement, shift
+        odometry, autopilot, servos, watched, trigger, payload, finite, jump, reset, disagreement, shift, alarm
     ), estimate
 
 
@@ -197,6 +206,7 @@ def _leap(before: Odometry, after: Odometry) -> Vec3:
 
 
 _O: Vec3 = (0.0, 0.0, 0.0)
+_QUIET = contact_trigger.State()
 
 
 def _nothing(payload: bool, ages: tuple[float, float, float]) -> Estimate:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from drivers.samples import Engage, FlightMode, JointMode, Landed
-from onboard.core import limits, math3, mission, safety
+from onboard.core import estimators, limits, math3, mission, safety
 from onboard.core.guidance import Progress
-from onboard.core.types import Estimate, Inputs, Phase, Reference, Verdict
+from onboard.core.types import Estimate, Estimator, Inputs, Phase, Reference, Verdict
 
 if TYPE_CHECKING:
     from onboard.core import compensation
@@ -136,8 +136,8 @@ def for_mission(
         blind=safety.blind(verdict),
         offboard_lost=safety.yielded(verdict),
         payload=believed.payload,
-        tare=seen.observer.tare,
-        tare_used=params.observer.tare,
+        tare=estimators.tare_in_force(seen.forces, params.estimators),
+        tare_used=params.observer.tare or params.estimators.selected is not Estimator.PAPER,
         go=go,
     )
 

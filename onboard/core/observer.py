@@ -9,8 +9,7 @@
 Eq. 11 adds the *desired* acceleration: in motion the observer then reads the trajectory's own acceleration as
 force. ``desired_acceleration`` keeps that form; without it the model is the thrust and gravity alone.
 F is the force on the vehicle; a pipe pressed with compression f pushes the vehicle back with -f along the
-contact normal. The tare subtracts what the observer reads in hover. It belongs to B: errors of mass and thrust lie
-along the thrust, an accelerometer's along its own axes, and both turn with the vehicle when it leans into the pipe.
+contact normal.
 """
 
 from __future__ import annotations
@@ -20,9 +19,7 @@ from typing import Annotated
 from msgspec import Struct
 
 from drivers.samples import Vec3
-from onboard.core import math3
 from onboard.core.spec import note, spec
-from onboard.core.types import Mat3
 
 
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,13 +36,10 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class State(Struct, frozen=True, gc=False):
-    """Filtered force F (N, W), lagged thrust (N), tare (N, B) and its running sum."""
+    """Filtered force F (N, W), not tared, and lagged thrust (N)."""
 
     force: Vec3 = (0.0, 0.0, 0.0)
     thrust: float = 0.0
-    tare: Vec3 = (0.0, 0.0, 0.0)
-    total: Vec3 = (0.0, 0.0, 0.0)
-    count: int = 0
 
 
 def step(
@@ -81,33 +75,4 @@ def step(
             fz + kappa * (mass * (acceleration[2] - mz) - fz),
         ),
         lagged,
-        state.tare,
-        state.total,
-        state.count,
     )
-
-
-def accumulate(state: State, R_WB: Mat3) -> State:
-    """Add the present reading to the running tare."""
-    f, t = math3.rotate_transposed(R_WB, state.force), state.total
-    return State(state.force, state.thrust, state.tare, (t[0] + f[0], t[1] + f[1], t[2] + f[2]), state.count + 1)
-
-
-def finish_tare(state: State) -> State:
-    """Adopt the mean of the accumulated readings as the tare, and start afresh."""
-    n = max(1, state.count)
-    t = state.total
-    return State(state.force, state.thrust, (t[0] / n, t[1] / n, t[2] / n), (0.0, 0.0, 0.0), 0)
-
-
-def drop_tare(state: State) -> State:
-    """Forget the accumulated readings of a tare that was broken off; the one before stays in force."""
-    return State(state.force, state.thrust, state.tare, (0.0, 0.0, 0.0), 0)
-
-
-def external_force(state: State, R_WB: Mat3, params: Params) -> Vec3:
-    """Estimated external force on the vehicle, tared when asked for, N, W."""
-    if not params.tare:
-        return state.force
-    f, t = state.force, math3.rotate(R_WB, state.tare)
-    return (f[0] - t[0], f[1] - t[1], f[2] - t[2])

@@ -15,6 +15,7 @@ from onboard.core import (
     contact_trigger,
     control,
     estimate,
+    estimators,
     force_profile,
     fuzzy,
     guidance,
@@ -47,6 +48,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     guidance: guidance.Params = guidance.Params()
     estimate: estimate.Params = estimate.Params()
     observer: observer.Params = observer.Params()
+    estimators: estimators.Params = estimators.Params()
     contact: contact_trigger.Params = contact_trigger.Params()
     force_profile: force_profile.Params = force_profile.Params()
     fuzzy: fuzzy.Params = fuzzy.Params()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from drivers.samples import Engage
-from onboard.core import actuation, control, estimate, facts, guidance, limits, mission, safety
+from drivers.samples import Engage, Interface
+from onboard.core import actuation, control, estimate, estimators, facts, guidance, limits, mission, safety
 from onboard.core.derived import derive
 from onboard.core.params import Params
 from onboard.core.types import Event, Inputs, Outputs, Reference
@@ -22,8 +22,8 @@ class State(Struct, frozen=True, gc=False):
     reference: Reference | None
     control: control.State
     limits: limits.State
-    thrust: float
-    """Thrust commanded in the last tick, N."""
+    command: estimators.Command
+    """Commanded in the last tick."""
     airborne: bool
     engaged: bool
     """The autopilot followed our set-points, and was asked to."""
@@ -33,7 +33,7 @@ def initial_state(params: Params) -> State:
     """On the ground, before the first sample."""
     return State(
         estimate.State(), safety.initial(), mission.initial(), guidance.Progress(), guidance.initial(), None,
-        control.State(), limits.State(), 0.0, False, False,
+        control.State(), limits.State(), estimators.Command(), False, False,
     )  # fmt: skip
 
 
@@ -45,7 +45,7 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
     lift = state.reference.lift if state.reference is not None else 0.0
 
     seen, believed = estimate.step(
-        state.estimate, inputs, before, state.progress, state.reference, state.thrust, derived, params, dt
+        state.estimate, inputs, before, state.progress, state.reference, state.command, derived, params, dt
     )
     flying = facts.airborne(state.airborne, seen, believed, before, state.guidance.home[2], lift)
     dangers = facts.for_safety(
@@ -70,9 +70,10 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
     gate, autopilot, servos, clipped = limits.step(
         state.limits, autopilot, servos, permission, facts.measured(seen), derived.bounds, dt
     )
+    sent = estimators.Command(autopilot.thrust, autopilot.torque_B if params.interface is Interface.WRENCH else None)
     events = tuple(Event(inputs.t_ns, *text) for text in (*alarms, *said)) if alarms or said else ()
     return (
-        State(seen, safe, task, progress, guided, reference, laws, gate, autopilot.thrust, flying, obeyed),
+        State(seen, safe, task, progress, guided, reference, laws, gate, sent, flying, obeyed),
         Outputs(task.phase, task.phase_time, verdict, believed, reference, wanted, autopilot, servos, clipped, events),
     )
 

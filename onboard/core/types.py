@@ -105,6 +105,43 @@ class Inputs(Struct, frozen=True, gc=False):
     """The station that commands."""
 
 
+class Estimator(StrEnum):
+    """The force estimators that run side by side."""
+
+    PAPER = "paper"
+    """The paper's disturbance observer, eq. 11 to 17."""
+    BODY = "body"
+    """Specific force less thrust, in B."""
+    MOMENTUM = "momentum"
+    """Generalised momentum, arm included."""
+    KALMAN = "kalman"
+    """Random walks of contact and wind."""
+
+
+class Force(Struct, frozen=True, gc=False):
+    """What one estimator reads."""
+
+    force_W: Vec3 = (0.0, 0.0, 0.0)
+    """External force on the vehicle, tared, N, W."""
+    contact: float = 0.0
+    """Compressive force on the pipe along the contact normal, N; positive presses."""
+
+
+class Forces(Struct, frozen=True, gc=False):
+    """What all estimators read, and what they share."""
+
+    paper: Force = Force()
+    body: Force = Force()
+    momentum: Force = Force()
+    kalman: Force = Force()
+    felt: float = 0.0
+    """Compression that the joints' currents tell of, N."""
+    thrust_scale: float = 1.0
+    """Thrust in hover over the thrust commanded."""
+    alarm: bool = False
+    """Away from the pipe: the contact trigger would have been pulled, had the tip been at the crack."""
+
+
 class Estimate(Struct, frozen=True, gc=False):
     """What the core believes about the vehicle. Angles of the body are ZYX Euler angles (roll, pitch, yaw), rad."""
 
@@ -136,6 +173,8 @@ class Estimate(Struct, frozen=True, gc=False):
     """Ages of the samples at the tick, s; infinity before the first."""
     valid: bool
     """All three devices have told something finite at least once."""
+    forces: Forces = Forces()
+    """Of all estimators; ``force_W`` and ``contact_force`` are the selected one's."""
 
 
 class Reference(Struct, frozen=True, gc=False):

@@ -55,7 +55,13 @@ def told(folder: Path) -> dict[str, Any]:
 
 
 def test_the_command_completes_the_mission(folder: Path, tuned: Flown, told: dict[str, Any]) -> None:
-    assert sorted(path.name for path in folder.iterdir()) == ["config.yaml", "log.mcap", "metrics.json", "report.html"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "config.yaml",
+        "costs.json",
+        "log.mcap",
+        "metrics.json",
+        "report.html",
+    ]
     assert completed(tuned)
     assert (told["scenario"], told["law"], told["seed"]) == ("paper", "tuned", 0)
     assert {**told, "wall_s": None} == tuned.metrics

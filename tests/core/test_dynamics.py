@@ -288,3 +288,22 @@ def test_nothing_is_compiled_in_flight() -> None:
     kernels: tuple[Any, ...] = (dynamics._inverse_dynamics, dynamics._contact_torque, dynamics._mass_and_coriolis)
     for kernel in kernels:
         assert len(kernel.signatures) == 1
+
+
+@vehicles
+@payloads
+def test_momentum_and_what_changes_it(vehicle: Vehicle, payload: bool) -> None:
+    """p = M qd; and C^T qd - G is the gradient of the Lagrangian along q, so that p' = tau + C^T qd - G."""
+    model = Model.from_vehicle(vehicle)
+    for q, qd, _ in states(11)[:10]:
+        p, drift = model.momentum(nine(q), nine(qd), payload)
+        assert p == pytest.approx(model.mass_matrix(nine(q), payload) @ qd, abs=1e-9)
+        assert drift == pytest.approx(
+            model.coriolis(nine(q), nine(qd), payload).T @ qd - np.array(model.gravity(nine(q), payload)), abs=1e-9
+        )
+        for i in range(9):
+            aside = np.zeros(9)
+            aside[i] = 1e-6
+            above, below = nine(q + aside), nine(q - aside)
+            lagrangian = [model.kinetic(at, nine(qd), payload) - model.potential(at, payload) for at in (above, below)]
+            assert drift[i] == pytest.approx((lagrangian[0] - lagrangian[1]) / 2e-6, abs=1e-4)

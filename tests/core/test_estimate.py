@@ -15,6 +15,7 @@ from onboard.config import load_config
 from onboard.core import estimate, kinematics
 from onboard.core.derived import derive
 from onboard.core.estimate import State
+from onboard.core.estimators import Command
 from onboard.core.guidance import Progress
 from onboard.core.kinematics import Tool
 from onboard.core.types import Estimate, Inputs, Phase
@@ -45,7 +46,7 @@ def believe(
     progress: Progress = Progress(),  # noqa: B008 - frozen
     thrust: float = MASS * G,
 ) -> tuple[State, Estimate]:
-    return estimate.step(state, seen, phase, progress, None, thrust, DERIVED, CONFIG, 0.004)
+    return estimate.step(state, seen, phase, progress, None, Command(thrust), DERIVED, CONFIG, 0.004)
 
 
 def after(state: State, ticks: int, seen: dict[str, Any], **how: Any) -> tuple[State, Estimate]:
@@ -342,7 +343,7 @@ def test_a_tare_broken_off_leaves_nothing_for_the_next() -> None:
     begun, taring = Progress(tare_begun=True), Progress(tare_begun=True, taring=True)
     state, _ = after(State(), LONG, pushed((0.0, -3.0, 0.0)), phase=Phase.TARE, progress=taring)
     state, _ = after(state, 1, pushed((0.0, -0.3, 0.0)), phase=Phase.HOLD)
-    assert state.observer.tare == (0.0, 0.0, 0.0)
+    assert [own.tare for own in state.forces.tares] == [(0.0, 0.0, 0.0)] * 4
     state, _ = after(state, LONG, pushed((0.0, -0.3, 0.0)), phase=Phase.HOLD, progress=begun)
     state, _ = after(state, 100, pushed((0.0, -0.3, 0.0)), phase=Phase.HOLD, progress=taring)
     state, _ = after(state, 20, pushed((0.0, -0.3, 0.0)), phase=Phase.HOLD, progress=begun)  # moved for a moment

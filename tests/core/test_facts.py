@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from drivers.samples import Engage, FlightMode, Landed
 from onboard.config import load_config
-from onboard.core import compensation, facts, mission, observer, safety
+from onboard.core import compensation, estimators, facts, mission, safety, tare
 from onboard.core import estimate as estimating
 from onboard.core.derived import derive
 from onboard.core.guidance import Progress
@@ -274,7 +274,9 @@ def test_what_a_request_to_go_or_to_tare_depends_on() -> None:
     told = known()
     assert (told.go, told.payload, told.tare_used) == (Phase.ALIGN, True, CONFIG.observer.tare)
     assert not known(believed=replace(HIGH, payload=False)).payload
-    assert known(replace(SEEN, observer=observer.State(tare=(0.1, 0.2, 0.3)))).tare == (0.1, 0.2, 0.3)
+    assert known(
+        replace(SEEN, forces=estimators.State(tares=(tare.State((0.1, 0.2, 0.3)), *(tare.State(),) * 3)))
+    ).tare == (0.1, 0.2, 0.3)
 
 
 # --- for the gate -----------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.samples import Vec3
-from onboard.core import admittance, contact_trigger, force_profile, math3, observer
+from onboard.core import admittance, contact_trigger, force_profile, math3, observer, tare
 from tests.core.strategies import number, vector
 
 DT = 0.004
@@ -74,7 +74,7 @@ def observe(
 def test_observer_reads_the_external_force_at_any_tilt(force: Vec3, lean: float) -> None:
     axis = (lean, 0.0, (1.0 - lean * lean) ** 0.5)
     state = observe(force, observer.Params(), axis=axis)
-    assert observer.external_force(state, LEVEL, observer.Params()) == pytest.approx(force, abs=1e-6)
+    assert state.force == pytest.approx(force, abs=1e-6)
 
 
 def test_observer_filter_is_equation_14() -> None:
@@ -95,15 +95,13 @@ def test_printed_form_reads_the_desired_acceleration_as_force() -> None:
 
 
 def test_tare_removes_what_is_read_in_hover() -> None:
-    p = observer.Params()
-    state = observe((0.1, -0.05, 0.2), p)
+    state = tare.State()
     for _ in range(100):
-        state = observer.accumulate(observe((0.1, -0.05, 0.2), p, seconds=DT, state=state), LEVEL)
-    state = observer.finish_tare(state)
+        state = tare.accumulate(state, (0.1, -0.05, 0.2))
+    assert tare.drop(state) == tare.State()
+    state = tare.finish(state)
     assert state.count == 0
-    assert observer.external_force(state, LEVEL, p) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
-    raw = observer.external_force(state, LEVEL, observer.Params(tare=False))
-    assert raw == pytest.approx((0.1, -0.05, 0.2), abs=1e-6)
+    assert tare.less((0.1, -0.05, 1.2), state.tare, LEVEL) == pytest.approx((0.0, 0.0, 1.0), abs=1e-6)
 
 
 @pytest.mark.parametrize("share", [0.85, 1.1])
@@ -114,11 +112,11 @@ def test_a_tare_in_hover_holds_for_a_leaning_vehicle_whose_thrust_is_not_what_is
     state = observer.State()
     for _ in range(500):
         state = observer.step(state, STILL, STILL, told, (0.0, 0.0, 1.0), MASS, G, p, DT)
-    state = observer.finish_tare(observer.accumulate(state, LEVEL))
+    hover = tare.finish(tare.accumulate(tare.State(), state.force))
     pushed = (-MASS * G * lean[2], 0.0, MASS * G * (1.0 - lean[8]))  # stands still with the thrust of the hover
     for _ in range(500):
         state = observer.step(state, STILL, STILL, told, (lean[2], lean[5], lean[8]), MASS, G, p, DT)
-    assert observer.external_force(state, lean, p) == pytest.approx(pushed, abs=1e-6)
+    assert tare.less(state.force, hover.tare, lean) == pytest.approx(pushed, abs=1e-6)
 
 
 def test_thrust_lag_delays_the_model() -> None:
@@ -144,10 +142,14 @@ NO_CONTACT = contact_trigger.State()
 
 
 def run(
-    pairs: list[tuple[float, float]], state: contact_trigger.State = NO_CONTACT, desired: float = 0.0
+    pairs: list[tuple[float, float]],
+    state: contact_trigger.State = NO_CONTACT,
+    desired: float = 0.0,
+    felt: float = 0.0,
+    params: contact_trigger.Params = T,
 ) -> contact_trigger.State:
     for distance, force in pairs:
-        state = contact_trigger.step(state, distance, force, desired, T, DT)
+        state = contact_trigger.step(state, distance, force, felt, desired, params, DT)
     return state
 
 
@@ -174,6 +176,22 @@ def test_a_push_into_nothing_is_told_at_once() -> None:
     assert not run([(0.0, 0.3 * 2.5)] * n, held, 2.5).contact
     assert run([(0.0, 0.5 * 2.5)] * 10 * n, held, 2.5).contact, "half the force is contact still"
     assert run([(0.0, 0.1)] * n, held, 0.3).contact, "at the bias, little force is nothing special"
+
+
+def test_a_force_that_the_joints_do_not_feel_is_wind() -> None:
+    asks = contact_trigger.Params(felt=0.2)
+    assert not run([(0.0, 1.0)] * 500, felt=0.1, params=asks).contact
+    assert run([(0.0, 1.0)] * 500, felt=0.3, params=asks).contact
+    assert not run([(0.0, 0.0)] * 500, felt=0.3, params=asks).contact, "nor do the joints alone make a contact"
+
+
+def test_a_force_that_rises_slowly_is_wind() -> None:
+    asks = contact_trigger.Params(onset=0.15, onset_time=0.5)
+    gust = [(0.0, 0.1 * DT * k) for k in range(round(10.0 / DT))]
+    assert not run(gust, params=asks).contact
+    touch = [(0.0, 0.5)] * 50 + [(0.0, 0.5 + 2.0 * DT * k) for k in range(round(0.5 / DT))]
+    assert run(touch, params=asks).contact
+    assert run(gust).contact, "without the onset asked for, it would pass for one"
 
 
 # --- force profile ----------------------------------------------------------------------------------------------------

@@ -53,15 +53,15 @@ def test_the_tare_takes_a_known_force_away_and_tells_it(hover: Flight) -> None:
 def test_a_tare_that_is_broken_off_changes_nothing(hover: Flight) -> None:
     hover.autopilot.spoil = biased
     hover.run(1.0)
-    before = hover.state.estimate.observer.tare
+    before = hover.state.estimate.forces.tares[0].tare
     hover.tick(Request.TARE)
     hover.run(hover.config.guidance.tare_settle + 1.0)
-    assert hover.state.estimate.observer.count > 0
+    assert hover.state.estimate.forces.tares[0].count > 0
     hover.tick(Request.LAND)
     hover.run(0.1)
     assert hover.said == ["tare_by_hand", "tare_broken_off", "land"]
-    observer = hover.state.estimate.observer
-    assert (observer.tare, observer.count) == (before, 0)
+    paper = hover.state.estimate.forces.tares[0]
+    assert (paper.tare, paper.count) == (before, 0)
 
 
 def test_beside_the_pipe_it_is_refused_until_the_vehicle_has_retreated(at: At) -> None:
