@@ -22,6 +22,7 @@ from groundstation import (
     completion,
     estop,
     events,
+    film,
     keys,
     lease,
     logs,
@@ -167,11 +168,17 @@ def _parser() -> argparse.ArgumentParser:
             help="set any parameter; may be repeated",
         )
         command.add_argument("--seed", type=int, metavar="N", help="of everything random in the world (default: 0)")
+    for command in (sim, desk, world):
+        command.add_argument(
+            "--plant",
+            choices=("rigid", "pybullet"),
+            help="who computes the motion of the simulated world (sets world.plant.kind; default: rigid)",
+        )
     for command in (sim, desk, onboard):
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
     of_vehicle = (status, watch, estop, preflight, lease, orders, events, params, logs, recompute)
-    for group in (*of_vehicle, calibrate, campaign, tune, keys, completion):
+    for group in (*of_vehicle, calibrate, campaign, tune, film, keys, completion):
         group.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")
@@ -240,7 +247,9 @@ def _common(options: argparse.Namespace) -> list[str]:
     arguments = [] if options.scenario is None else [f"{name}={options.scenario}"]
     given = {name: getattr(options, name) for name in ("law", "seed")}
     arguments += [f"--{name}={value}" for name, value in given.items() if value is not None]
-    return [*arguments, *(f"--set={item}" for item in options.sets)]
+    plant = getattr(options, "plant", None)
+    sets = [*options.sets, *([] if plant is None else [f"world.plant.kind={plant}"])]
+    return [*arguments, *(f"--set={item}" for item in sets)]
 
 
 def _run_options(options: argparse.Namespace) -> list[str]:

@@ -67,6 +67,7 @@ def compute(run: Run, wall_s: float | None = None) -> dict[str, Any]:
         "scenario": run.info.scenario,
         "law": run.info.law,
         "seed": run.info.seed,
+        "plant": None if run.truth is None else run.config.world.plant.kind,
         "version": run.info.version,
         "sim_s": float(run.t[-1]),
         "wall_s": wall_s,

@@ -163,6 +163,14 @@ class _Vehicle(Struct):
     servo: _Servo
 
 
+class _Plant(Struct, frozen=True):
+    kind: str = "rigid"
+
+
+class _World(Struct, frozen=True):
+    plant: _Plant = _Plant()
+
+
 class _Estimators(Struct, frozen=True):
     selected: str = "paper"
 
@@ -174,6 +182,7 @@ class RunConfig(Struct):
     repair: Repair
     plan: _Plan
     vehicle: _Vehicle
+    world: _World = _World()
     estimators: _Estimators = _Estimators()
 
 

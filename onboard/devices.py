@@ -53,10 +53,13 @@ class DeviceSet:
 
 
 def world_of(config: Config) -> World:
-    """The simulated world of a configuration."""
+    """The simulated world of a configuration. Raises ConfigError for one that cannot be had."""
     pipe = config.pipe
     heading = radians(pipe.heading_deg)
-    return World(config.vehicle, config.world, pipe.position, heading, pipe.radius, pipe.length, config.seed)
+    try:
+        return World(config.vehicle, config.world, pipe.position, heading, pipe.radius, pipe.length, config.seed)
+    except ValueError as error:
+        raise ConfigError([str(error)]) from error
 
 
 def mock_devices(world: World) -> DeviceSet:

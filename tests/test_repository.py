@@ -131,7 +131,7 @@ def test_every_third_party_import_is_declared() -> None:
     for package in PACKAGES:
         for path in files(package):
             third = {module.split(".")[0] for module in imports(path)} - known
-            other = {"yaml": "pyyaml", "serial": "pyserial", "zenoh": "eclipse-zenoh"}
+            other = {"yaml": "pyyaml", "serial": "pyserial", "zenoh": "eclipse-zenoh", "PIL": "pillow"}
             names = {other.get(module, canonical(module)) for module in third}
             allowed = ground if package == "groundstation" else desk if path.name in ("main.py", "ukf.py") else base
             allowed = vision if path.name.startswith("t265") else button if path.name == "button.py" else allowed

@@ -61,6 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         before,
         stepped,
         flown,
+        flight.fly_in_pybullet(config, given.longest),
         compare.compare(config.fuzzy, config.vehicle),
         servos.rows(given.cycles // 2),
         setpoints.measure(given.cycles),

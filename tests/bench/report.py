@@ -30,6 +30,8 @@ class Report(Struct, frozen=True):
     conditions: dict[str, str]
     core: Core
     flight: Flight
+    bullet: Flight | None
+    """The same mission in PyBullet; None where that is not installed."""
     comparisons: tuple[Comparison, ...]
     servos: tuple[ServoCycle, ...]
     setpoints: SetPoints

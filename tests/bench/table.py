@@ -6,6 +6,7 @@ from tests.bench.core import Part
 from tests.bench.desk import Desk
 from tests.bench.emergency.measure import Emergency
 from tests.bench.emergency.stations import PATIENCE
+from tests.bench.flight import Flight
 from tests.bench.measure import Stat
 from tests.bench.report import TARGET_US, Report
 from tests.bench.throughput import TARGET, Throughput
@@ -18,7 +19,7 @@ _EIGHTHS = " ▏▎▍▌▋▊▉"
 
 def table(report: Report) -> str:
     """All of a report, section by section."""
-    parts = (_conditions, _core, _flight, _comparisons, _real_time)
+    parts = (_conditions, _core, _mission, _other_world, _comparisons, _real_time)
     lines = [line for part in parts for line in part(report)]
     lines += _worlds(report.worlds)
     if report.throughput is not None:
@@ -65,9 +66,12 @@ def _core(report: Report) -> list[str]:
     return lines
 
 
-def _flight(report: Report) -> list[str]:
-    f = report.flight
-    lines = _head(f"Mission, {f.sim_s:.1f} s to {f.ended_in}", "median us", "p99 us", "of wall")
+def _mission(report: Report) -> list[str]:
+    return _flight(report.flight, "Mission")
+
+
+def _flight(f: Flight, name: str) -> list[str]:
+    lines = _head(f"{name}, {f.sim_s:.1f} s to {f.ended_in}", "median us", "p99 us", "of wall")
 
     def share(seconds: float) -> str:
         return f"{100.0 * seconds / f.wall_s:>9.1f} %   "
@@ -77,7 +81,7 @@ def _flight(report: Report) -> list[str]:
         _line(
             f"world, a tick of {f.steps_per_tick} steps",
             f.world,
-            share(f.world_s) + f"{f.steps_per_s / 1e6:.2f} M steps/s, {f.speed:.0f} x real time",
+            share(f.world_s) + f"{f.steps_per_s / 1e3:.3g} k steps/s, {f.speed:.3g} x real time",
         )
     )
     lines.append(
@@ -92,6 +96,12 @@ def _flight(report: Report) -> list[str]:
     whole = f"{f.wall_s:.2f} s of wall time for {f.sim_s:.1f} s simulated"
     lines.append(f"{'whole mission':<{_NAME}}{whole}: {f.sim_s / f.wall_s:.1f} times real time")
     return lines
+
+
+def _other_world(report: Report) -> list[str]:
+    if report.bullet is None:
+        return [*_head("In PyBullet"), "skipped: pybullet is not installed"]
+    return _flight(report.bullet, "In PyBullet")
 
 
 def _comparisons(report: Report) -> list[str]:

@@ -31,6 +31,9 @@ def test_a_short_run_fills_the_table(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert flight["core_s"] + flight["world_s"] + flight["recorder_s"] < flight["wall_s"]
     assert flight["sim_s"] == pytest.approx(4.0)
     assert flight["log_bytes"] > 100_000
+    other = report["bullet"]
+    assert other["sim_s"] == pytest.approx(4.0)
+    assert 0.0 < other["sim_s"] / other["world_s"] < flight["sim_s"] / flight["world_s"]
     for row in report["comparisons"]:
         assert row["ratio"] is None or row["difference"] < 0.01, row["package"]
     assert [row["baud"] for row in report["servos"]] == [1_000_000, 4_000_000]
@@ -48,6 +51,8 @@ def test_a_short_run_fills_the_table(tmp_path: Path, capsys: pytest.CaptureFixtu
         "dynamics",
         "limits",
         "recorder",
+        "In PyBullet",
+        "a tick of 16 steps",
         "fuzzy law",
         "mass matrix",
         "servo cycle",
