@@ -18,9 +18,11 @@ from typing import NoReturn
 
 from groundstation import (
     calibrate,
+    campaign,
     completion,
     estop,
     events,
+    film,
     keys,
     lease,
     logs,
@@ -29,6 +31,7 @@ from groundstation import (
     preflight,
     recompute,
     status,
+    tune,
     watch,
 )
 from groundstation.codes import BROKEN, DONE, INTERRUPTED, LOST, NOT_THERE, REFUSED, WRONG_INPUT
@@ -70,7 +73,11 @@ examples:
   pipewright onboard --config /etc/pipewright.yaml --mission --out /var/log/pipewright/today
 """
 #: Packages that a vehicle's computer does not need, and the extra that brings each.
-_EXTRAS = {"cryptography": "ground", "rich": "ground", "textual": "ground", "tqdm": "sim"}
+_EXTRAS = {
+    "cryptography": "ground", "dask": "campaign", "distributed": "campaign", "matplotlib": "ground",
+    "optuna": "campaign", "pyarrow": "campaign", "rich": "ground", "scipy": "campaign", "textual": "ground",
+    "tqdm": "sim",
+}  # fmt: skip
 _LOG_HELP = "log.mcap of a run, or its run folder"
 
 
@@ -118,6 +125,9 @@ def _parser() -> argparse.ArgumentParser:
         "sim", help=words, description=words.capitalize() + ".", epilog=_SIM_EPILOG, formatter_class=raw
     )
     sim.add_argument("--scenario", metavar="NAME|FILE", help="where the pipe is and what to do (default: paper)")
+    sim.add_argument(
+        "--longest", type=float, metavar="SECONDS", help="break off after so much simulated time (default: 900)"
+    )
     sim.set_defaults(run=_sim)
     words = "fly it in real time, real drivers against emulated devices"
     desk = commands.add_parser(
@@ -158,24 +168,17 @@ def _parser() -> argparse.ArgumentParser:
             help="set any parameter; may be repeated",
         )
         command.add_argument("--seed", type=int, metavar="N", help="of everything random in the world (default: 0)")
+    for command in (sim, desk, world):
+        command.add_argument(
+            "--plant",
+            choices=("rigid", "pybullet"),
+            help="who computes the motion of the simulated world (sets world.plant.kind; default: rigid)",
+        )
     for command in (sim, desk, onboard):
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
-    for group in (
-        status,
-        watch,
-        estop,
-        preflight,
-        lease,
-        orders,
-        events,
-        params,
-        logs,
-        recompute,
-        calibrate,
-        keys,
-        completion,
-    ):
+    of_vehicle = (status, watch, estop, preflight, lease, orders, events, params, logs, recompute)
+    for group in (*of_vehicle, calibrate, campaign, tune, film, keys, completion):
         group.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")
@@ -244,13 +247,17 @@ def _common(options: argparse.Namespace) -> list[str]:
     arguments = [] if options.scenario is None else [f"{name}={options.scenario}"]
     given = {name: getattr(options, name) for name in ("law", "seed")}
     arguments += [f"--{name}={value}" for name, value in given.items() if value is not None]
-    return [*arguments, *(f"--set={item}" for item in options.sets)]
+    plant = getattr(options, "plant", None)
+    sets = [*options.sets, *([] if plant is None else [f"world.plant.kind={plant}"])]
+    return [*arguments, *(f"--set={item}" for item in sets)]
 
 
 def _run_options(options: argparse.Namespace) -> list[str]:
     duration = getattr(options, "duration", None)
+    longest = getattr(options, "longest", None)
     quiet = ["--no-progress"] if options.no_progress else []
-    return [*quiet, *([] if duration is None else [f"--duration={duration}"])]
+    limits = [("duration", duration), ("longest", longest)]
+    return [*quiet, *(f"--{name}={value}" for name, value in limits if value is not None)]
 
 
 def _out(options: argparse.Namespace) -> Path:

@@ -67,6 +67,7 @@ def compute(run: Run, wall_s: float | None = None) -> dict[str, Any]:
         "scenario": run.info.scenario,
         "law": run.info.law,
         "seed": run.info.seed,
+        "plant": None if run.truth is None else run.config.world.plant.kind,
         "version": run.info.version,
         "sim_s": float(run.t[-1]),
         "wall_s": wall_s,
@@ -212,6 +213,7 @@ def _contact(run: Run, window: Windows) -> dict[str, Any]:
         if truth is not None and touched
         else None,
         "bounces": len(gaps) if truth is not None and touched else None,
+        "longest_gap": max(gaps, default=0.0) if truth is not None and touched else None,
         "time_without_contact": float(sum(gaps)) if truth is not None and touched else None,
     }
 

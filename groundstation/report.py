@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from groundstation import estimators, figures, health, punctuality, table
+from groundstation import estimators, figures, film, health, punctuality, table
 from groundstation.run import Run
 from groundstation.svg import Chart
 from onboard.messages import Severity
@@ -52,6 +53,7 @@ def _page(run: Run, metrics: dict[str, Any], beside: Sequence[dict[str, Any]]) -
     yield from _figure("Actuation (figure 7)", note, figures.actuation(run), pair=False)
     note = "The drawing is to scale, with the vehicle to the left; the broken circle is the needle's path."
     yield from _figure("At the pipe", note, figures.at_the_pipe(run), pair=True)
+    yield from _film(run.path.parent / film.FOLDER)
     yield from _health(run, metrics)
     yield from _timing(run, metrics)
     yield from _events(run)
@@ -134,6 +136,17 @@ def _figure(heading: str, note: str, charts: list[Chart], *, pair: bool) -> Iter
         for chart in charts:
             yield f"<div{' class=drawing' if chart.equal else ''}>{chart.svg()}</div>"
         yield "</div>"
+
+
+def _film(folder: Path) -> Iterator[str]:
+    """What ``pipewright film`` has made of the run, if it has."""
+    pictures = [(folder / name, words) for name, words in ((film.FILM, "the mission"), (film.SHEET, "its phases"))]
+    found = [(path, words) for path, words in pictures if path.is_file()]
+    if found:
+        yield "<h2>Film</h2>"
+    for path, words in found:
+        data = b64encode(path.read_bytes()).decode()
+        yield f'<p><img alt="{words}" style="max-width:100%" src="data:image/{path.suffix[1:]};base64,{data}"></p>'
 
 
 def _health(run: Run, metrics: dict[str, Any]) -> Iterator[str]:

@@ -68,7 +68,8 @@ class Figure(NamedTuple):
 
 def name(metrics: dict[str, Any]) -> str:
     """What tells a run from others."""
-    return f"scenario {metrics['scenario']}, law {metrics['law']}, seed {metrics['seed']}"
+    plant = f", {metrics['plant']}" if metrics["plant"] not in (None, "rigid") else ""
+    return f"scenario {metrics['scenario']}, law {metrics['law']}, seed {metrics['seed']}{plant}"
 
 
 def rows(metrics: dict[str, Any]) -> list[Row]:

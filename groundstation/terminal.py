@@ -43,7 +43,8 @@ def summarize(
     for heading in ("", "paper", "this run", "in contact", "unit", "verdict"):
         side.add_column(heading, justify="right" if heading in ("paper", "this run", "in contact") else "left")
     for other in beside:
-        side.add_column(f"{other['law']}\nseed {other['seed']}", justify="right", no_wrap=True)
+        plant = f"\n{other['plant']}" if other["plant"] not in (None, "rigid") else ""
+        side.add_column(f"{other['law']}\nseed {other['seed']}{plant}", justify="right", no_wrap=True)
     columns = [table.rows(other) for other in beside]
     for i, row in enumerate(table.rows(metrics)):
         value, contact, *rest = (

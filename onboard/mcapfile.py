@@ -12,10 +12,12 @@ import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from enum import IntEnum
 from io import BytesIO
 from typing import Any, BinaryIO
 
 import msgspec
+import msgspec.inspect
 import zstandard
 from mcap import records
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -56,7 +58,9 @@ def _whole(what: str) -> Iterator[None]:
 def flat_schema(kind: Any) -> dict[str, Any]:
     """JSON Schema of a msgspec type in the small dialect that plotting tools read.
 
-    References are inlined, an optional value has the schema of the value, and a tuple is an array of its first item.
+    References are inlined, an optional value has the schema of the value, a tuple is an array of its first item, and
+    an integer with names is one of constants. The dialect has no arrays of arrays, and one that names such a field is
+    refused as a whole: the field is in the messages, but not in the schema.
     """
     schema = msgspec.json.schema(kind)
     definitions = schema.get("$defs", {})
@@ -71,13 +75,36 @@ def flat_schema(kind: Any) -> dict[str, Any]:
             "integer" if all(isinstance(v, int) for v in node.get("enum", [""])) else "string"
         )
         if flat["type"] == "object":
-            flat["properties"] = {name: flatten(child) for name, child in node.get("properties", {}).items()}
+            fields = {name: flatten(child) for name, child in node.get("properties", {}).items()}
+            flat["properties"] = {name: field for name, field in fields.items() if not _nested(field)}
         elif flat["type"] == "array":
             item = (node.get("prefixItems") or [node.get("items")])[0]
             flat["items"] = flatten(item) if isinstance(item, dict) else {"type": "string"}
+        elif flat["type"] == "integer" and "enum" in flat:
+            named = {enum.__name__: enum for enum in _integer_enums(msgspec.inspect.type_info(kind))}
+            if (enum := named.get(flat.get("title", ""))) is not None:
+                flat["oneOf"] = [{"title": value.name, "const": value.value} for value in enum]
+                del flat["enum"]
         return flat
 
     return flatten(schema)
+
+
+def _nested(field: dict[str, Any]) -> bool:
+    return bool(field["type"] == "array" and field["items"]["type"] == "array")
+
+
+def _integer_enums(node: Any) -> Iterator[type[IntEnum]]:
+    """Every enumeration of integers in what msgspec tells of a type."""
+    if isinstance(node, msgspec.inspect.EnumType):
+        if issubclass(node.cls, IntEnum):
+            yield node.cls
+    elif isinstance(node, msgspec.Struct):
+        for name in node.__struct_fields__:
+            yield from _integer_enums(getattr(node, name))
+    elif isinstance(node, tuple):
+        for part in node:
+            yield from _integer_enums(part)
 
 
 class Channel:

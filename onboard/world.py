@@ -26,6 +26,7 @@ from onboard.config import Config
 from onboard.device_config import Kind
 from onboard.devices import parameter_file, world_of
 from onboard.layers import ConfigError
+from sim_backend.array_plant import PlantKind
 from sim_backend.dynamixel_emulator import emulate
 from sim_backend.faults import Fault, Faults, read_faults
 from sim_backend.pace import Crier, Face, Pace
@@ -37,6 +38,8 @@ from sim_backend.world_link import WorldServer
 
 #: After which the thread of one emulator hands the interpreter to another's, s: each answers within milliseconds.
 SWITCH_INTERVAL = 0.0005
+#: The same beside PyBullet, which does not let go of the interpreter while it computes.
+BUSY_SWITCH_INTERVAL = 0.0002
 #: A flight process that is left alone lands first; the world stays for it, but not longer, s.
 LAST_FLIGHT = 150.0
 _GLANCE = 0.05
@@ -137,7 +140,8 @@ def serve(config: Config, servo_link: Path | None = None) -> None:
 
     process = WorldProcess(config, say, servo_link)
     pace = process.pace
-    sys.setswitchinterval(SWITCH_INTERVAL)
+    busy = config.world.plant.kind is not PlantKind.RIGID
+    sys.setswitchinterval(BUSY_SWITCH_INTERVAL if busy else SWITCH_INTERVAL)
 
     def stop(*_: Any) -> None:
         pace.stop()

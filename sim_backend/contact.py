@@ -120,6 +120,19 @@ def friction(
 
 
 @compiled()
+def grip(p: Array, ahead: float, up: float, along: float) -> float:
+    """Factor on both friction coefficients at a place on the pipe: from its axis (ahead, up), and along it, m."""
+    if p[at.UNEVENNESS] == 0.0:
+        return 1.0
+    round_the_pipe = p[at.PIPE_RADIUS] * atan2(up, -ahead)
+    waves = 0.0
+    for i in range(WAVES):
+        row = at.WAVE + 3 * i
+        waves += sin(p[row] * along + p[row + 1] * round_the_pipe + p[row + 2])
+    return float(max(SLIPPERIEST, 1.0 + p[at.UNEVENNESS] * waves * sqrt(2.0 / WAVES)))
+
+
+@compiled()
 def pipe_contact(x: Array, p: Array, tip: Three, velocity: Three) -> Three:
     """Force of the pipe on the gripper's tip, N, W; updates the bristle, the slip and the contact figures in ``x``.
 
@@ -149,15 +162,7 @@ def pipe_contact(x: Array, p: Array, tip: Three, velocity: Three) -> Three:
     round_speed = vu * ea - va * eu
     axial_speed = velocity[1] * nx - velocity[0] * ny
     normal = max(0.0, p[at.CONTACT_STIFFNESS] * penetration - p[at.CONTACT_DAMPING] * outward)
-    grip = 1.0
-    if p[at.UNEVENNESS] != 0.0:
-        round_the_pipe = p[at.PIPE_RADIUS] * atan2(up, -ahead)
-        along = ry * nx - rx * ny
-        waves = 0.0
-        for i in range(WAVES):
-            row = at.WAVE + 3 * i
-            waves += sin(p[row] * along + p[row + 1] * round_the_pipe + p[row + 2])
-        grip = max(SLIPPERIEST, 1.0 + p[at.UNEVENNESS] * waves * sqrt(2.0 / WAVES))
+    share = grip(p, ahead, up, ry * nx - rx * ny)
     f_round, f_axial, mode, z1, z2, slid = friction(
         x[at.CONTACT_MODE],
         x[at.CONTACT_STRETCH],
@@ -168,8 +173,8 @@ def pipe_contact(x: Array, p: Array, tip: Three, velocity: Three) -> Three:
         p[at.STEP],
         p[at.CONTACT_TANGENTIAL_STIFFNESS],
         p[at.CONTACT_TANGENTIAL_DAMPING],
-        grip * p[at.CONTACT_STATIC],
-        grip * p[at.CONTACT_KINETIC],
+        share * p[at.CONTACT_STATIC],
+        share * p[at.CONTACT_KINETIC],
     )
     x[at.CONTACT_MODE] = mode
     x[at.CONTACT_STRETCH] = z1

@@ -1,4 +1,4 @@
-"""Where each quantity stands in the flat arrays that the kernels of the rigid-body world work on.
+"""Where each quantity stands in the flat arrays that the kernels of the worlds work on.
 
 ``x`` is the state of the world, ``p`` its constants, ``u`` what drives it. Three arrays keep the call of a kernel
 cheap; the indices below are compile-time constants.
@@ -31,7 +31,7 @@ SPECIFIC_FORCE_SUM = 47  # 3, sum over the steps of the advance, m/s^2, B
 JOINT_TORQUE = 50  # 3, N m, at the output
 SERVO_CURRENT = 53  # 3, A
 ON_GROUND = 56  # 1 while anything touches: a limp arm may carry what the skids do not
-CRASH = 57  # 0, or a code of rigid_body.CRASHES
+CRASH = 57  # 0, or a code of array_plant.CRASHES
 CRASH_VALUE = 58
 RATE_INTEGRAL = 59  # 3, N m, of the autopilot's rate loop
 PHASE = 62  # physics steps since the inner loops ran

@@ -26,13 +26,13 @@ from drivers.protocols import DeviceError
 from drivers.thrust import thrust_fraction
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.array_plant import PlantParams
 from sim_backend.autopilot import STOPPED, Rotors
 from sim_backend.knob import knob, switch
 from sim_backend.motors import rated_voltage
 from sim_backend.pace import Crier, Pace
 from sim_backend.px4_sensors import Px4SensorParams, Px4Sensors
 from sim_backend.px4_wire import LostError, wire_of
-from sim_backend.rigid_body import PlantParams
 from sim_backend.sensors import REALISTIC, SensorParams, hover_thrust
 from sim_backend.world import World, WorldParams
 

@@ -1,4 +1,4 @@
-"""One simulated world: the rigid-body plant, the autopilot around it, the servo bus, the sensors, and its clock."""
+"""One simulated world: a plant, the autopilot around it, the servo bus, the sensors, and its clock."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from drivers.samples import JointMode, ServoCommand, Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.array_plant import ArrayPlant, PlantKind, PlantParams, truth_of
 from sim_backend.autopilot import Autopilot, AutopilotParams
-from sim_backend.compiled import compiled
-from sim_backend.deviations import DeviationParams, deviations
-from sim_backend.inner_loops import LoopParams, inner_loops, put_loops
+from sim_backend.deviations import AS_MODELLED, DeviationParams, Deviations, deviations
+from sim_backend.inner_loops import LoopParams, put_loops
 from sim_backend.plant import Truth
-from sim_backend.rigid_body import PlantParams, RigidBody, physics, truth_of
+from sim_backend.rigid_body import RigidBody
 from sim_backend.sensors import SensorParams, Sensors, Snapshot
 from sim_backend.wind import Wind, WindParams
 
@@ -40,20 +40,22 @@ class WorldParams(Struct, frozen=True, forbid_unknown_fields=True):
     deviations: DeviationParams = DeviationParams()
 
 
-@compiled("(f8[::1], f8[::1], f8[::1], i8)")
-def _fly(x: Array, p: Array, u: Array, steps: int) -> None:
-    """Advance by ``steps`` physics steps, running the inner loops whenever they are due."""
-    period = int(p[at.LOOP_STEPS])
-    done = 0
-    while done < steps:
-        phase = int(x[at.PHASE])
-        if phase == 0:
-            inner_loops(x, p, u)
-        count = min(period - phase, steps - done)
-        physics(x, p, u, count)
-        done += count
-        phase += count
-        x[at.PHASE] = 0.0 if phase == period else phase
+def plant_of(
+    vehicle: Vehicle,
+    params: PlantParams,
+    pipe_position: Vec3,
+    pipe_heading: float,
+    pipe_radius: float,
+    pipe_length: float,
+    truth: Deviations = AS_MODELLED,
+) -> ArrayPlant:
+    """The plant of the kind that ``params`` asks for; ValueError when this machine cannot have it."""
+    if params.kind is PlantKind.RIGID:
+        return RigidBody(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
+    # Imported here since not every machine that flies has PyBullet.
+    from sim_backend.pybullet_plant import PyBulletPlant
+
+    return PyBulletPlant(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
 
 
 class World:
@@ -81,8 +83,8 @@ class World:
         self.params = params = params or WorldParams()
         #: How the true vehicle and pipe differ from ``vehicle`` and the pipe that was asked for.
         self.deviations = truth = deviations(params.deviations, seed)
-        self.plant = RigidBody(vehicle, params.plant, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
-        put_loops(self.plant.p, vehicle, params.loops, params.plant.step)
+        self.plant = plant_of(vehicle, params.plant, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
+        put_loops(self.plant.p, vehicle, params.loops, self.plant.step)
         self.autopilot = Autopilot(params.autopilot, seed)
         self.wind = Wind(params.wind, seed)
         self.sensors = Sensors(params.sensors, vehicle, seed)
@@ -116,11 +118,10 @@ class World:
     def advance(self, duration: float) -> None:
         """Advance by ``duration`` seconds, a whole number of physics steps (else ValueError)."""
         plant = self.plant
-        x, u, step = plant.x, plant.u, plant.params.step
+        x, u, step = plant.x, plant.u, plant.step
         left = total = plant.steps_of(duration)
         longest = ceil(MODE_PERIOD / step)
-        x[at.CONTACT_PEAK] = 0.0
-        x[at.SPECIFIC_FORCE_SUM : at.SPECIFIC_FORCE_SUM + 3] = 0.0
+        plant.begin()
         commanded, self._servo_command = self._servo_command, None
         if commanded is not None:
             command, limp = commanded
@@ -140,7 +141,7 @@ class World:
             count = min(left, longest)
             if until < count:
                 count = max(1, ceil(until - 1e-6))
-            _fly(x, plant.p, u, count)
+            plant.fly(count)
             plant.count(count)
             left -= count
             state = x.tolist()

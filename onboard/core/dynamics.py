@@ -60,8 +60,12 @@ class Model:
 
     def momentum(self, q: Nine, qd: Nine, payload: bool) -> tuple[Nine, Nine]:
         """Generalised momentum p = M qd, and C^T qd - G: what p' is beside the generalised forces."""
+        return momentum(q, qd, *self.packed(payload))
+
+    def packed(self, payload: bool) -> tuple[Array, Array]:
+        """What the kernels are told of the vehicle: ``parts`` and ``turning``."""
         variant = self._variants[payload]
-        return _momentum(q, qd, variant.parts, variant.turning)
+        return variant.parts, variant.turning
 
     def contact_torque(self, q: Nine, force_W: Vec3) -> Nine:
         """J_tip^T F: generalised forces of a force (N, W) that acts on the gripper's tip."""
@@ -328,8 +332,11 @@ def _spin(wx: float, wy: float, wz: float, c: float, s: float, rate: float, iner
 
 
 @compiled("UniTuple(UniTuple(f8, 9), 2)(UniTuple(f8, 9), UniTuple(f8, 9), f8[:, ::1], f8[:, ::1])")
-def _momentum(q: Nine, qd: Nine, parts: Array, turning: Array) -> tuple[Nine, Nine]:
-    """The gradients of the Lagrangian T - V along qd and along q, by sums over the parts, without the matrices."""
+def momentum(q: Nine, qd: Nine, parts: Array, turning: Array) -> tuple[Nine, Nine]:
+    """``Model.momentum``, for kernels: the gradients of the Lagrangian along qd and along q.
+
+    By sums over the parts, without the matrices.
+    """
     cf, sf, ct, st, cp, sp = cos(q[3]), sin(q[3]), cos(q[4]), sin(q[4]), cos(q[5]), sin(q[5])
     r11, r12, r13 = cp * ct, cp * st * sf - sp * cf, cp * st * cf + sp * sf
     r21, r22, r23 = sp * ct, sp * st * sf + cp * cf, sp * st * cf - cp * sf

@@ -12,16 +12,22 @@ from msgspec import Struct
 
 from drivers.samples import ServoState, Vec3
 from onboard.core import body_observer, kalman_observer, math3, momentum_observer, observer, tare, thrust_model
+from onboard.core.compiled import compiled
 from onboard.core.derived import Derived
 from onboard.core.spec import note, spec
+from onboard.core.tare import less
 from onboard.core.told import Told
 from onboard.core.types import Estimator, Force, Forces, Mat3
 
 if TYPE_CHECKING:
     from onboard.core.params import Params as AllParams
 
+Five = tuple[float, float, float, float, float]
+
 #: No force of this world, N or N m.
 _ABSURD = 1e4
+#: Of the tares.
+_PLACE = {estimator: place for place, estimator in enumerate(Estimator)}
 #: Currents older than this feel nothing of now, s.
 _LATE = 0.05
 
@@ -120,23 +126,24 @@ def step(
         a, b, c, d = (tare.drop(old) for old in tares)
         tares, joints = (a, b, c, d), tare.drop(joints)
 
-    at_joints = math3.subtract(momentum.joints, joints.tare)
-    x, z = momentum_observer.force_at_tip(at_joints, told.q[6:], params.vehicle.arm)
-    felt = (R[0] * x + R[2] * z, R[3] * x + R[5] * z, R[6] * x + R[8] * z)
-    n = derived.site.normal
+    felt = momentum_observer.felt(momentum, joints.tare, told.q[6:], R, params.vehicle.arm)
     one, two, three, four = tares
-    seen = (
-        Force(*_read(paper.force, one.tare, R, n))
-        if params.observer.tare
-        else Force(paper.force, _along(paper.force, n)),
-        Force(*_read(body.force, two.tare, R, n)),
-        Force(*_read(momentum.force, three.tare, R, n)),
-        # its disturbance holds whatever was there before the contact: only the whole force wants a tare
-        Force(tare.less(kalman.force, four.tare, R), _along(kalman.contact, n)),
-    )
+    read = _read(
+        paper.force, one.tare if params.observer.tare else tare.ZERO, body.force, two.tare, momentum.force, three.tare,
+        kalman.force, four.tare, kalman.contact, felt, R, derived.site.normal,
+    )  # fmt: skip
+    f1, f2, f3, f4, (c1, c2, c3, c4, c5) = read
     return (
         State(thrust, paper, body, momentum, kalman, tares, joints, felt),
-        Forces(*seen, _along(felt, n), math3.subtract(kalman.force, kalman.contact), thrust.scale),
+        Forces(
+            Force(f1, c1),
+            Force(f2, c2),
+            Force(f3, c3),
+            Force(f4, c4),
+            c5,
+            math3.subtract(kalman.force, kalman.contact),
+            thrust.scale,
+        ),  # fmt: skip
     )
 
 
@@ -152,20 +159,35 @@ def selected(forces: Forces, params: Params) -> Force:
 
 def tare_in_force(state: State, params: Params) -> Vec3:
     """Tare of the selected estimator, N, B."""
-    return state.tares[tuple(Estimator).index(params.selected)].tare
+    return state.tares[_PLACE[params.selected]].tare
 
 
 def _sound(force: Vec3) -> bool:
     return abs(force[0]) + abs(force[1]) + abs(force[2]) < _ABSURD
 
 
-def _along(force: Vec3, normal: tuple[float, float]) -> float:
-    return -(force[0] * normal[0] + force[1] * normal[1])
+@compiled(
+    "Tuple((UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 5)))"
+    "(UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 3),"
+    " UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 9), UniTuple(f8, 2))"
+)
+def _read(
+    f1: Vec3, t1: Vec3, f2: Vec3, t2: Vec3, f3: Vec3, t3: Vec3, f4: Vec3, t4: Vec3, contact: Vec3, felt: Vec3, R: Mat3,
+    n: tuple[float, float],
+) -> tuple[Vec3, Vec3, Vec3, Vec3, Five]:  # fmt: skip
+    """Forces (W) less their tares (B); and compressions, the last but one of the Kalman filter's contact force.
 
-
-def _read(force: Vec3, tare_B: Vec3, R: Mat3, normal: tuple[float, float]) -> tuple[Vec3, float]:
-    tared = tare.less(force, tare_B, R)
-    return tared, _along(tared, normal)
+    Its disturbance holds whatever was there before the contact: only its whole force wants a tare.
+    """
+    a, b, c, d = less(f1, t1, R), less(f2, t2, R), less(f3, t3, R), less(f4, t4, R)
+    x, y = n
+    return (
+        a, b, c, d,
+        (
+            -(a[0] * x + a[1] * y), -(b[0] * x + b[1] * y), -(c[0] * x + c[1] * y),
+            -(contact[0] * x + contact[1] * y), -(felt[0] * x + felt[1] * y),
+        ),
+    )  # fmt: skip
 
 
 def tell(
@@ -179,23 +201,17 @@ def tell(
     v = (v[0] + age * a[0], v[1] + age * a[1], v[2] + age * a[2])
     x, y, z = math3.rotate_transposed(sight.R, v)
     base = vehicle.base.drag
-    rates, supply = servos.velocity, own.momentum.supply_current
     torque = (0.0, 0.0, 0.0)
     if command.torque_B is not None:
         torque = math3.euler_torque_from_body(sight.rpy, command.torque_B)
-    servo, current = vehicle.servo, servos.current
     return (
         Told(
             sight.f_B, a, sight.desired, sight.R, v, sight.fresh, (*sight.p_W, *sight.rpy, *servos.position[:3]),
-            (*v, *sight.rpy_rate, *rates[:3]), command.thrust, thrust_model.thrust(thrust),
+            (*v, *sight.rpy_rate, *servos.velocity[:3]), command.thrust, thrust_model.thrust(thrust),
             (-base[0] * x, -base[1] * y, -base[2] * z), torque, command.torque_B is not None,
-            (
-                momentum_observer.servo_torque(current[0], rates[0], servo, supply),
-                momentum_observer.servo_torque(current[1], rates[1], servo, supply),
-                momentum_observer.servo_torque(current[2], rates[2], servo, supply),
-            ),
-            state.felt, servos.torque_on and sight.servos_age < _LATE and not any(servos.error[:3]), sight.near,
-            derived.site.normal, mass, vehicle.gravity, sight.payload,
+            servos.current[:3], vehicle.servo, state.felt,
+            servos.torque_on and sight.servos_age < _LATE and not any(servos.error[:3]),
+            sight.near, derived.site.normal, mass, vehicle.gravity, sight.payload,
         ),
         thrust,
     )  # fmt: skip

@@ -25,9 +25,13 @@ from msgspec import Struct
 from drivers.samples import Vec3
 from drivers.vehicle import Arm, Servo
 from onboard.core.compiled import compiled
-from onboard.core.dynamics import Model
+from onboard.core.dynamics import Array, Model, momentum
 from onboard.core.spec import note, spec
 from onboard.core.told import Nine, Told
+from onboard.core.types import Mat3
+
+Four = tuple[float, float, float, float]
+Five = tuple[float, float, float, float, float]
 
 #: From this rate on a joint slides, rad/s; well above the grain of a servo's rate.
 _SLIDING = 0.05
@@ -69,37 +73,40 @@ class State(Struct, frozen=True, gc=False):
 
 def step(state: State, told: Told, model: Model, params: Params, dt: float) -> State:
     """One tick."""
-    v = told.v_W
     if not state.begun:
-        q = told.q
-        p, _ = model.momentum(q, (*v, *told.qd[3:]), told.payload)
-        return State(p, _ZERO, v, True)
-    a, old = told.a_W, state.velocity
-    share = min(1.0, params.velocity_gain * dt)
-    v = (
-        old[0] + a[0] * dt + share * (v[0] - old[0]),
-        old[1] + a[1] * dt + share * (v[1] - old[1]),
-        old[2] + a[2] * dt + share * (v[2] - old[2]),
-    )
-    p, drift = model.momentum(told.q, (*v, *told.qd[3:]), told.payload)
-    predicted, residual = _step(
-        state.predicted, p, drift, told.R, told.thrust, told.drag, told.torque, told.joint_torque,
-        (params.force_gain, params.torque_gain if told.torque_known else 0.0, params.joint_gain), dt,
+        p, _ = model.momentum(told.q, told.qd, told.payload)
+        return State(p, _ZERO, told.v_W, True)
+    parts, turning = model.packed(told.payload)
+    predicted, residual, velocity = _step(
+        state.predicted, state.velocity, told.q, told.qd, told.a_W, told.R, told.thrust, told.drag, told.torque,
+        told.currents, servo_constants(told.servo), params.supply_current,
+        (params.force_gain, params.torque_gain if told.torque_known else 0.0, params.joint_gain, params.velocity_gain),
+        dt, parts, turning,
     )  # fmt: skip
-    return State(predicted, residual, v, True)
+    return State(predicted, residual, velocity, True)
 
 
-def servo_torque(current: float, rate: float, servo: Servo, supply: bool) -> float:
+def servo_constants(servo: Servo) -> Five:
+    """What ``servo_torque`` is to know of a servo."""
+    return (
+        servo.stall_torque, servo.stall_current, servo.no_load_speed, servo.friction_static, servo.friction_viscous
+    )  # fmt: skip
+
+
+@compiled("f8(f8, f8, UniTuple(f8, 5), b1)")
+def servo_torque(current: float, rate: float, servo: Five, supply: bool) -> float:
     """Torque of a joint servo at its output by its current (A) and rate (rad/s), N m.
 
     The gear's friction is taken off as far as it is known: all of it while the joint moves, none while it sticks.
 
-    supply: the current is that of the supply, motor current times duty cycle, and the duty cycle is what overcomes
-    resistance and back-EMF: i / i_stall = s |s + rate / no-load rate| with s = torque / stall torque.
+    servo: ``servo_constants``. supply: the current is that of the supply, motor current times duty cycle, and the duty
+    cycle is what overcomes resistance and back-EMF: i / i_stall = s |s + rate / no-load rate| with s = torque / stall
+    torque.
     """
-    share = current / servo.stall_current
+    stall_torque, stall_current, no_load_speed, friction_static, friction_viscous = servo
+    share = current / stall_current
     if supply and share != 0.0:
-        speed = rate / servo.no_load_speed
+        speed = rate / no_load_speed
         sign = 1.0 if share > 0.0 else -1.0
         square, four = speed * speed, 4.0 * abs(share)
         if sign * speed < 0.0 and four <= square:
@@ -108,24 +115,32 @@ def servo_torque(current: float, rate: float, servo: Servo, supply: bool) -> flo
         else:
             share = 0.5 * (sign * sqrt(square + four) - speed)
     slip = max(-1.0, min(1.0, rate / _SLIDING))
-    return servo.stall_torque * share - slip * servo.friction_static - rate * servo.friction_viscous
+    return stall_torque * share - slip * friction_static - rate * friction_viscous
 
 
 @compiled(
-    "UniTuple(UniTuple(f8, 9), 2)"
-    "(UniTuple(f8, 9), UniTuple(f8, 9), UniTuple(f8, 9), UniTuple(f8, 9), f8, UniTuple(f8, 3), UniTuple(f8, 3),"
-    " UniTuple(f8, 3), UniTuple(f8, 3), f8)"
+    "Tuple((UniTuple(f8, 9), UniTuple(f8, 9), UniTuple(f8, 3)))"
+    "(UniTuple(f8, 9), UniTuple(f8, 3), UniTuple(f8, 9), UniTuple(f8, 9), UniTuple(f8, 3), UniTuple(f8, 9), f8,"
+    " UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 5), b1, UniTuple(f8, 4), f8, f8[:, ::1],"
+    " f8[:, ::1])"
 )
 def _step(
-    predicted: Nine, p: Nine, drift: Nine, r: Nine, thrust: float, drag: Vec3, torque: Vec3,
-    joints: Vec3, gains: Vec3, dt: float,
-) -> tuple[Nine, Nine]:  # fmt: skip
+    predicted: Nine, velocity: Vec3, q: Nine, qd: Nine, a: Vec3, r: Nine, thrust: float, drag: Vec3, torque: Vec3,
+    currents: Vec3, servo: Five, supply: bool, gains: Four, dt: float, parts: Array, turning: Array,
+) -> tuple[Nine, Nine, Vec3]:  # fmt: skip
+    g0, g1, g2, follow = gains
+    share = min(1.0, follow * dt)
+    vx = velocity[0] + a[0] * dt + share * (qd[0] - velocity[0])
+    vy = velocity[1] + a[1] * dt + share * (qd[1] - velocity[1])
+    vz = velocity[2] + a[2] * dt + share * (qd[2] - velocity[2])
+    p, drift = momentum(q, (vx, vy, vz, qd[3], qd[4], qd[5], qd[6], qd[7], qd[8]), parts, turning)
     x, y, z = drag[0], drag[1], thrust + drag[2]
     tau = (
         r[0] * x + r[1] * y + r[2] * z, r[3] * x + r[4] * y + r[5] * z, r[6] * x + r[7] * y + r[8] * z,
-        torque[0], torque[1], torque[2], joints[0], joints[1], joints[2],
+        torque[0], torque[1], torque[2],
+        servo_torque(currents[0], qd[6], servo, supply), servo_torque(currents[1], qd[7], servo, supply),
+        servo_torque(currents[2], qd[8], servo, supply),
     )  # fmt: skip
-    g0, g1, g2 = gains
     # the residual of now is in its own prediction, which keeps any gain stable: r = K / (1 + K dt) (p - p_known)
     k0, k1, k2 = g0 / (1.0 + g0 * dt), g1 / (1.0 + g1 * dt), g2 / (1.0 + g2 * dt)
     e = (
@@ -142,27 +157,29 @@ def _step(
         p[3] if still else p[3] - f[3] / g1, p[4] if still else p[4] - f[4] / g1, p[5] if still else p[5] - f[5] / g1,
         p[6] - f[6] / g2, p[7] - f[7] / g2, p[8] - f[8] / g2,
     )  # fmt: skip
-    return after, f
+    return after, f, (vx, vy, vz)
 
 
-def force_at_tip(joints: Vec3, angles: Vec3, arm: Arm) -> tuple[float, float]:
-    """Force (x, z of B, N) at the gripper's tip that explains external joint torques (N m) best, in least squares."""
-    return _force_at_tip(joints, angles, (arm.link_1, arm.link_2, arm.gripper))
+def felt(state: State, tare: Vec3, angles: Vec3, R_WB: Mat3, arm: Arm) -> Vec3:
+    """Force at the gripper's tip in the arm's plane that explains the torques less their tare (N m) best, N, W."""
+    return _felt(state.residual, tare, angles, R_WB, (arm.link_1, arm.link_2, arm.gripper))
 
 
-@compiled("UniTuple(f8, 2)(UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 3))")
-def _force_at_tip(joints: Vec3, angles: Vec3, lengths: Vec3) -> tuple[float, float]:
+@compiled("UniTuple(f8, 3)(UniTuple(f8, 9), UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 9), UniTuple(f8, 3))")
+def _felt(residual: Nine, tare: Vec3, angles: Vec3, r: Nine, lengths: Vec3) -> Vec3:
     xx = xz = zz = bx = bz = 0.0
     for i in range(3):
         jx, jz = -lengths[i] * sin(angles[i]), lengths[i] * cos(angles[i])
+        torque = residual[6 + i] - tare[i]
         xx += jx * jx
         xz += jx * jz
         zz += jz * jz
-        bx += jx * joints[i]
-        bz += jz * joints[i]
+        bx += jx * torque
+        bz += jz * torque
     # a stretched arm feels nothing along itself: there the least force is taken
     ridge = 1e-3 * (xx + zz)
     xx += ridge
     zz += ridge
     det = xx * zz - xz * xz
-    return (zz * bx - xz * bz) / det, (xx * bz - xz * bx) / det
+    x, z = (zz * bx - xz * bz) / det, (xx * bz - xz * bx) / det
+    return r[0] * x + r[2] * z, r[3] * x + r[5] * z, r[6] * x + r[8] * z

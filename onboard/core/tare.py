@@ -10,6 +10,7 @@ from msgspec import Struct
 
 from drivers.samples import Vec3
 from onboard.core import math3
+from onboard.core.compiled import compiled
 from onboard.core.types import Mat3
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
@@ -39,7 +40,12 @@ def drop(state: State) -> State:
     return State(state.tare)
 
 
+@compiled("UniTuple(f8, 3)(UniTuple(f8, 3), UniTuple(f8, 3), UniTuple(f8, 9))")
 def less(force: Vec3, tare: Vec3, R_WB: Mat3) -> Vec3:
     """A force in W less a tare in B."""
-    t = math3.rotate(R_WB, tare)
-    return (force[0] - t[0], force[1] - t[1], force[2] - t[2])
+    x, y, z = tare
+    return (
+        force[0] - (R_WB[0] * x + R_WB[1] * y + R_WB[2] * z),
+        force[1] - (R_WB[3] * x + R_WB[4] * y + R_WB[5] * z),
+        force[2] - (R_WB[6] * x + R_WB[7] * y + R_WB[8] * z),
+    )

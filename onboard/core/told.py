@@ -5,6 +5,7 @@ from __future__ import annotations
 from msgspec import Struct
 
 from drivers.samples import Vec3
+from drivers.vehicle import Servo
 from onboard.core.types import Mat3
 
 #: Nine generalised coordinates, rates or forces.
@@ -39,8 +40,9 @@ class Told(Struct, frozen=True, gc=False):
     """Generalised forces of the commanded body torque on the Euler angles, N m."""
     torque_known: bool
     """The autopilot is sent torques; what its own loops do is not known."""
-    joint_torque: Vec3
-    """What the servos give by their currents, N m."""
+    currents: Vec3
+    """Of the joints' servos, A."""
+    servo: Servo
     felt: Vec3
     """Force at the tip by the joints' torques one tick ago, tared, N, W."""
     joints_known: bool

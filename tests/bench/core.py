@@ -58,7 +58,7 @@ INSIDE: dict[str, dict[str, tuple[Where, ...]]] = {
     "estimate": {
         "paper's observer": ((observer, "step"),),
         "body observer": ((body_observer, "step"),),
-        "momentum observer": ((momentum_observer, "step"), (momentum_observer, "force_at_tip")),
+        "momentum observer": ((momentum_observer, "step"), (momentum_observer, "felt")),
         "Kalman filter": ((kalman_observer, "step"),),
         "what they are told": ((estimators, "tell"),),
         "tip": ((kinematics, "tip_W"),),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter_ns
@@ -11,11 +12,13 @@ from typing import Any
 from unittest.mock import patch
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from onboard import loop, simulate
 from onboard.config import Config
 from onboard.core.types import Outputs, Tick
 from onboard.recorder import Recorder
+from sim_backend.array_plant import PlantKind
 from sim_backend.world import World
 from tests.bench.measure import Probe, Stat, stat
 
@@ -60,6 +63,14 @@ def _kept(ticks: list[Tick]) -> Iterator[None]:
         yield
 
 
+def fly_in_pybullet(config: Config, longest: float | None = None) -> Flight | None:
+    """The same mission in PyBullet; None where that is not installed."""
+    if find_spec("pybullet") is None:
+        return None
+    plant = replace(config.world.plant, kind=PlantKind.PYBULLET)
+    return fly(replace(config, world=replace(config.world, plant=plant)), longest)[0]
+
+
 def fly(config: Config, longest: float | None = None) -> tuple[Flight, list[Tick]]:
     """Fly the mission once; ``longest`` breaks it off after so much simulated time, s."""
     core, world, ticking = Probe((loop, "step")), Probe((World, "advance")), Probe((Recorder, "tick"))
@@ -78,7 +89,7 @@ def fly(config: Config, longest: float | None = None) -> tuple[Flight, list[Tick
         wall = (perf_counter_ns() - start) * 1e-9
         size = log.stat().st_size
     sim_s = ticks[-1].inputs.t_ns * 1e-9
-    step = config.world.plant.step
+    step = config.world.plant.physics_step
     advancing = sum(world.spans) * 1e-9
     return (
         Flight(

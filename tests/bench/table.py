@@ -6,8 +6,11 @@ from tests.bench.core import Part
 from tests.bench.desk import Desk
 from tests.bench.emergency.measure import Emergency
 from tests.bench.emergency.stations import PATIENCE
+from tests.bench.flight import Flight
 from tests.bench.measure import Stat
 from tests.bench.report import TARGET_US, Report
+from tests.bench.throughput import TARGET, Throughput
+from tests.bench.worlds import Worlds
 
 WIDTH = 100
 _NAME, _BAR = 32, 30
@@ -16,8 +19,11 @@ _EIGHTHS = " ▏▎▍▌▋▊▉"
 
 def table(report: Report) -> str:
     """All of a report, section by section."""
-    parts = (_conditions, _core, _flight, _comparisons, _real_time)
+    parts = (_conditions, _core, _mission, _other_world, _comparisons, _real_time)
     lines = [line for part in parts for line in part(report)]
+    lines += _worlds(report.worlds)
+    if report.throughput is not None:
+        lines += _throughput(report.throughput)
     if report.emergency is not None:
         lines += emergency_rows(report.emergency)
     return "\n".join(lines if report.desk is None else [*lines, *desk_rows(report.desk)])
@@ -60,9 +66,12 @@ def _core(report: Report) -> list[str]:
     return lines
 
 
-def _flight(report: Report) -> list[str]:
-    f = report.flight
-    lines = _head(f"Mission, {f.sim_s:.1f} s to {f.ended_in}", "median us", "p99 us", "of wall")
+def _mission(report: Report) -> list[str]:
+    return _flight(report.flight, "Mission")
+
+
+def _flight(f: Flight, name: str) -> list[str]:
+    lines = _head(f"{name}, {f.sim_s:.1f} s to {f.ended_in}", "median us", "p99 us", "of wall")
 
     def share(seconds: float) -> str:
         return f"{100.0 * seconds / f.wall_s:>9.1f} %   "
@@ -72,7 +81,7 @@ def _flight(report: Report) -> list[str]:
         _line(
             f"world, a tick of {f.steps_per_tick} steps",
             f.world,
-            share(f.world_s) + f"{f.steps_per_s / 1e6:.2f} M steps/s, {f.speed:.0f} x real time",
+            share(f.world_s) + f"{f.steps_per_s / 1e3:.3g} k steps/s, {f.speed:.3g} x real time",
         )
     )
     lines.append(
@@ -87,6 +96,12 @@ def _flight(report: Report) -> list[str]:
     whole = f"{f.wall_s:.2f} s of wall time for {f.sim_s:.1f} s simulated"
     lines.append(f"{'whole mission':<{_NAME}}{whole}: {f.sim_s / f.wall_s:.1f} times real time")
     return lines
+
+
+def _other_world(report: Report) -> list[str]:
+    if report.bullet is None:
+        return [*_head("In PyBullet"), "skipped: pybullet is not installed"]
+    return _flight(report.bullet, "In PyBullet")
 
 
 def _comparisons(report: Report) -> list[str]:
@@ -120,6 +135,26 @@ def _real_time(report: Report) -> list[str]:
     lines.append(_line("bare timer, lateness", late.bare, f"{1.0:>11.1f}"))
     lines.append(_line("  the loop with the core", late.loop, f"{late.ratio:>11.1f}"))
     return lines
+
+
+def _worlds(worlds: Worlds) -> list[str]:
+    lines = _head("Physics of one core", "steps/s", "step us", "ratio")
+    lines.append(f"{'rigid-body world, ours':<{_NAME}}{worlds.ours:>11,.0f}{1e6 * worlds.step:>11.0f}{1.0:>11.1f}")
+    if worlds.theirs_same is None or worlds.theirs_own is None:
+        return [*lines, f"  {worlds.package}"]
+    for rate, step in ((worlds.theirs_same, worlds.step), (worlds.theirs_own, 0.010)):
+        ratio = worlds.ours / rate
+        lines.append(f"{f'  {worlds.package}':<{_NAME}}{rate:>11,.0f}{1e6 * step:>11.0f}{ratio:>11.1f}")
+    return [*lines, "    (its multirotor alone; ours has arm, contact, motors, servos and the autopilot's loops)"]
+
+
+def _throughput(told: Throughput) -> list[str]:
+    lines = _head(f"Campaign, {told.runs} runs of {told.sim_s:g} s", "wall s", "x real", "ratio")
+    whole = told.runs * told.sim_s
+    verdict = "met" if told.ratio >= TARGET else "MISSED"
+    lines.append(f"{'one worker':<{_NAME}}{told.one:>11.2f}{whole / told.one:>11.1f}{1.0:>11.2f}")
+    row = f"{'two workers':<{_NAME}}{told.two:>11.2f}{told.speed:>11.1f}{told.ratio:>11.2f}"
+    return [*lines, f"{row}   target {TARGET:g}: {verdict}"]
 
 
 def emergency_rows(emergency: Emergency) -> list[str]:

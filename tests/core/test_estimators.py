@@ -343,7 +343,8 @@ def test_the_torque_is_found_from_the_current_of_the_supply(torque: float, rate:
         return  # braking, where two torques draw the same current, or beyond what the supply can give
     current = servo.stall_current * share * abs(share + speed)
     quiet = replace(servo, friction_static=0.0, friction_viscous=0.0)
-    assert momentum_observer.servo_torque(current, rate, quiet, True) == pytest.approx(torque, abs=1e-6)
+    constants = momentum_observer.servo_constants(quiet)
+    assert momentum_observer.servo_torque(current, rate, constants, True) == pytest.approx(torque, abs=1e-6)
 
 
 @given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-0.4, 0.4))
@@ -351,8 +352,9 @@ def test_the_torque_is_found_from_the_current_of_the_supply(torque: float, rate:
 def test_the_force_at_the_tip_is_found_from_its_torques(x: float, z: float, theta_3: float) -> None:
     angles = (-1.0, 1.0, theta_3)
     rows = DERIVED.model.contact_torque((*ZERO, *ZERO, *angles), (x, 0.0, z))
-    found = momentum_observer.force_at_tip(rows[6:], angles, CONFIG.vehicle.arm)
-    assert found == pytest.approx((x, z), abs=0.02)
+    state = momentum_observer.State(residual=(*ZERO, *ZERO, *rows[6:]))
+    found = momentum_observer.felt(state, ZERO, angles, math3.matrix_from_euler(ZERO), CONFIG.vehicle.arm)
+    assert found == pytest.approx((x, 0.0, z), abs=0.02)
 
 
 # --- tare, gate and trigger -------------------------------------------------------------------------------------------

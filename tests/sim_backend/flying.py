@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import cos, sin, sqrt
+from math import atan2, cos, sin, sqrt
 
 import msgspec
 import numpy as np
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from drivers.samples import AutopilotCommand, Engage, Interface, JointMode, ServoCommand, Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.array_plant import BulletParams, PlantKind, PlantParams
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
-from sim_backend.rigid_body import PlantParams, RigidBody
+from sim_backend.pybullet_plant import PyBulletPlant
+from sim_backend.rigid_body import RigidBody
 from sim_backend.world import World, WorldParams
 
 TICK = 0.004
@@ -51,6 +53,22 @@ def plant_at(
     p[at.GRAVITY] = 0.0
     p[at.DRAG : at.DRAG + 3] = 0.0
     u[at.U_TORQUE_ON] = 0.0
+    return plant
+
+
+def to_bullet(world: World) -> PyBulletPlant:
+    """Have PyBullet move the vehicle of a rigid-body world from here on; gives its plant."""
+    one = world.plant
+    x, p, u, steps = one.x, one.p, one.u, round(one.p[at.LOOP_STEPS] * one.step / BulletParams().step)
+    normal, length = p[at.PIPE_NORMAL : at.PIPE_NORMAL + 2], 2.0 * float(p[at.PIPE_HALF_LENGTH])
+    where = (float(p[at.PIPE_POINT]), float(p[at.PIPE_POINT + 1]), float(p[at.PIPE_POINT + 2]))
+    params = msgspec.structs.replace(one.params, kind=PlantKind.PYBULLET)
+    heading, radius = atan2(normal[1], normal[0]), float(p[at.PIPE_RADIUS])
+    plant = PyBulletPlant(world.vehicle, params, where, heading, radius, length)
+    plant.x[:], plant.u[:], plant.p[at.LOOP :] = x, u, p[at.LOOP :]
+    plant.p[at.LOOP_STEPS], plant.x[at.PHASE] = steps, 0.0
+    plant.steps = round(world.time / plant.step)
+    world.plant = plant
     return plant
 
 

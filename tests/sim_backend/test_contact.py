@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.array_plant import PlantParams
 from sim_backend.contact import SLIDE, STICK, ContactParams, GroundParams, friction
 from sim_backend.dynamics import accelerations
-from sim_backend.rigid_body import PlantParams, RigidBody, advance
+from sim_backend.rigid_body import RigidBody
 from sim_backend.world import WorldParams
 from tests.sim_backend.flying import PIPE, RADIUS, frictionless, plant_at, world_at_pipe
 from tests.sim_backend.test_rigid_body import balance
@@ -134,7 +135,7 @@ def tip_mass(plant: RigidBody) -> float:
 
 
 def touchdown(plant: RigidBody, seconds: float = 0.03) -> list[float]:
-    advance(plant.x, plant.p, plant.u, plant.steps_of(seconds))
+    plant.move(plant.steps_of(seconds))
     return plant.x.tolist()
 
 
@@ -173,7 +174,7 @@ def test_contact_is_the_same_at_any_heading(vehicle: Vehicle, heading: float) ->
     plant.x[at.VELOCITY : at.VELOCITY + 3] = (c * v[0] - s * v[1], s * v[0] + c * v[1], v[2])
     plant.x[at.ATTITUDE : at.ATTITUDE + 4] = (cos(heading / 2), 0.0, 0.0, sin(heading / 2))
     for each in (reference, plant):
-        advance(each.x, each.p, each.u, 3)
+        each.move(3)
     force = reference.truth().contact_W
     assert force[0] < -3.0
     assert force[1] < 0.0
@@ -187,13 +188,13 @@ def test_contact_is_the_same_at_any_heading(vehicle: Vehicle, heading: float) ->
 def test_the_pipe_has_two_ends(vehicle: Vehicle, beside: float, touches: bool) -> None:
     plant = plant_at(vehicle, PlantParams(), gap=-1e-4)
     plant.x[at.POSITION + 1] += beside
-    advance(plant.x, plant.p, plant.u, 1)
+    plant.move(1)
     assert bool(plant.x[at.CONTACT_FORCE] > 0.0) is touches
 
 
 def test_the_contact_only_pushes(vehicle: Vehicle) -> None:
     plant = plant_at(vehicle, PlantParams(), gap=-1e-5, velocity=(-0.5, 0.0, 0.0))
-    advance(plant.x, plant.p, plant.u, 1)
+    plant.move(1)
     assert plant.x[at.CONTACT_FORCE] == 0.0
     assert plant.truth().contact_W == pytest.approx((0.0, 0.0, 0.0))
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.array_plant import PlantParams, constants
 from sim_backend.contact import SLIDE, SLIPPERIEST, ContactParams, pipe_contact
 from sim_backend.deviations import AS_MODELLED, DeviationParams, deviations, mass_of
 from sim_backend.motors import near_surfaces
-from sim_backend.rigid_body import PlantParams, advance, constants
 from sim_backend.servos import joint_torque
 from sim_backend.world import World, WorldParams
 from tests.sim_backend.flying import PIPE, RADIUS, REACH, plant_at
@@ -71,7 +71,7 @@ def test_the_world_hovers_on_another_thrust_than_the_model_says(vehicle: Vehicle
         x, u = plant.x, plant.u
         x[at.POSITION + 2] = 5.0
         u[at.U_ROTOR : at.U_ROTOR + 4] = 0.25 * mass_of(vehicle) * vehicle.gravity
-        advance(x, plant.p, u, 1)
+        plant.move(1)
         lift = x[at.ROTOR : at.ROTOR + 4].sum() / (truth.mass * mass_of(vehicle) * vehicle.gravity)
         assert lift == pytest.approx(truth.thrust / truth.mass)
 
@@ -191,7 +191,7 @@ def test_play_creates_no_energy(vehicle: Vehicle) -> None:
     plant.x[at.JOINT_RATE : at.JOINT_RATE + 3] = (0.5, -0.4, 0.6)
     swings = []
     for _ in range(200):
-        advance(plant.x, plant.p, plant.u, 10)
+        plant.move(10)
         swings.append(float(np.abs(plant.x[at.JOINT_RATE : at.JOINT_RATE + 3]).max()))
     assert max(swings) < 1.5
     assert np.isfinite(plant.x).all()

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from drivers.samples import FlightMode, Interface, Quat
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.array_plant import PlantParams, constants
 from sim_backend.autopilot import AutopilotParams, SetPoint
 from sim_backend.inner_loops import LoopParams, airframe_inertia, attitude_rate, mix, put_loops
-from sim_backend.rigid_body import PlantParams, constants
 from sim_backend.world import World, WorldParams
 from tests.sim_backend.flying import PIPE, RADIUS, mass_of
 

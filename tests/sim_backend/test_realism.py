@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from drivers.samples import AutopilotState, FlightMode, Interface, Landed, Odometry
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
+from sim_backend.array_plant import PlantParams, constants
 from sim_backend.autopilot import Autopilot, AutopilotParams, SetPoint
 from sim_backend.motors import rotors
-from sim_backend.rigid_body import PlantParams, constants
 from sim_backend.sensors import (
     REALISTIC,
     AutopilotSensorParams,

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from drivers.vehicle import Carrier, Vehicle
 from sim_backend import layout as at
+from sim_backend.array_plant import PlantParams
 from sim_backend.plant import Actuation
-from sim_backend.rigid_body import PlantParams, RigidBody
+from sim_backend.rigid_body import RigidBody
 from tests.sim_backend.flying import PIPE, RADIUS, mass_of, plant_at
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.vehicle import Vehicle
-from sim_backend.rigid_body import PlantParams
+from sim_backend.array_plant import PlantParams
 from sim_backend.sensors import (
     AutopilotSensorParams,
     OdometryParams,

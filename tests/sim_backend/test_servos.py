@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
-from sim_backend.rigid_body import PlantParams, constants
+from sim_backend.array_plant import PlantParams, constants
 from sim_backend.servos import joint_torque, stop_torque, tool_servos
 from tests.sim_backend.flying import PIPE, RADIUS
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
-from sim_backend.rigid_body import PlantParams, advance
+from sim_backend.array_plant import PlantParams
 from sim_backend.wind import PERIOD, Wind, WindParams, scales
 from sim_backend.world import World, WorldParams
 from tests.sim_backend.flying import REACH, plant_at
@@ -90,7 +90,8 @@ def specific_force(vehicle: Vehicle, params: PlantParams, velocity: Vec3, wind: 
     plant.x[at.ROTOR : at.ROTOR + 4] = 5.9
     plant.u[at.U_ROTOR : at.U_ROTOR + 4] = 5.9
     plant.u[at.U_WIND : at.U_WIND + 3] = wind
-    advance(plant.x, plant.p, plant.u, 1)
+    plant.begin()
+    plant.move(1)
     return plant.x[at.SPECIFIC_FORCE_SUM : at.SPECIFIC_FORCE_SUM + 2].copy()
 
 

@@ -12,9 +12,9 @@ import pytest
 from drivers.protocols import AutopilotDevice, OdometryDevice, ServoDevice
 from drivers.samples import Engage, FlightMode, Interface, JointMode, Landed, ServoCommand, Vec3
 from drivers.vehicle import Vehicle
+from sim_backend.array_plant import PlantParams
 from sim_backend.autopilot import AutopilotParams, SetPoint
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
-from sim_backend.rigid_body import PlantParams
 from sim_backend.world import World, WorldParams
 from tests.sim_backend.flying import TICK, Hand, mass_of, world_at_pipe
 from tests.sim_backend.noisy import NOISY

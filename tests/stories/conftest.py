@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 
 import pytest
@@ -23,8 +24,8 @@ MOMENTS = (
     ("retreat", Phase.RETREAT, 1.0),
     ("landing", Phase.LAND, 1.5),
 )
-#: The paper's mission with a short hold.
-SETS = ("repair.hold=2.0",)
+#: The paper's mission with a short hold; PIPEWRIGHT_PLANT=pybullet tells all stories in that world.
+SETS = ("repair.hold=2.0", f"world.plant.kind={os.environ.get('PIPEWRIGHT_PLANT', 'rigid')}")
 
 At = Callable[[str], Flight]
 
