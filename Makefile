@@ -14,6 +14,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 RUN := $(VENV)/.installed-run
 DEV := $(VENV)/.installed-dev
+BENCH := $(VENV)/.installed-bench
 INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt
 ARGS ?=
 
@@ -46,7 +47,7 @@ check: $(DEV)
 	$(PY) -m mypy
 	$(VENV)/bin/lint-imports
 
-bench: $(DEV)
+bench: $(BENCH)
 	@$(PY) -m tests.bench $(ARGS)
 
 clean:
@@ -62,9 +63,13 @@ $(PY):
 	"$(PYTHON)" -m venv $(VENV)
 
 $(RUN): pyproject.toml constraints.txt | $(PY)
-	$(INSTALL) -e '.[sim,ground,vision]'
+	$(INSTALL) -e '.[sim,ground,campaign,vision]'
 	@touch $@
 
 $(DEV): $(RUN)
-	$(INSTALL) -e '.[sim,ground,vision,dev]'
+	$(INSTALL) -e '.[sim,ground,campaign,vision,dev]'
+	@touch $@
+
+$(BENCH): $(DEV)
+	$(INSTALL) -e '.[sim,ground,campaign,vision,dev,bench]'
 	@touch $@

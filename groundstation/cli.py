@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from groundstation import (
     calibrate,
+    campaign,
     completion,
     estop,
     events,
@@ -30,6 +31,7 @@ from groundstation import (
     preflight,
     recompute,
     status,
+    tune,
     watch,
 )
 from groundstation.codes import BROKEN, DONE, INTERRUPTED, LOST, NOT_THERE, REFUSED, WRONG_INPUT
@@ -71,7 +73,11 @@ examples:
   pipewright onboard --config /etc/pipewright.yaml --mission --out /var/log/pipewright/today
 """
 #: Packages that a vehicle's computer does not need, and the extra that brings each.
-_EXTRAS = {"cryptography": "ground", "rich": "ground", "textual": "ground", "tqdm": "sim"}
+_EXTRAS = {
+    "cryptography": "ground", "dask": "campaign", "distributed": "campaign", "matplotlib": "ground",
+    "optuna": "campaign", "pyarrow": "campaign", "rich": "ground", "scipy": "campaign", "textual": "ground",
+    "tqdm": "sim",
+}  # fmt: skip
 _LOG_HELP = "log.mcap of a run, or its run folder"
 
 
@@ -119,6 +125,9 @@ def _parser() -> argparse.ArgumentParser:
         "sim", help=words, description=words.capitalize() + ".", epilog=_SIM_EPILOG, formatter_class=raw
     )
     sim.add_argument("--scenario", metavar="NAME|FILE", help="where the pipe is and what to do (default: paper)")
+    sim.add_argument(
+        "--longest", type=float, metavar="SECONDS", help="break off after so much simulated time (default: 900)"
+    )
     sim.set_defaults(run=_sim)
     words = "fly it in real time, real drivers against emulated devices"
     desk = commands.add_parser(
@@ -168,8 +177,8 @@ def _parser() -> argparse.ArgumentParser:
     for command in (sim, desk, onboard):
         command.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: a new one in runs/)")
         command.add_argument("--no-progress", action="store_true", help="no progress bar")
-    of_vehicle = (status, watch, estop, preflight, lease, orders, events, params, logs)
-    for group in (*of_vehicle, recompute, calibrate, keys, completion, film):
+    of_vehicle = (status, watch, estop, preflight, lease, orders, events, params, logs, recompute)
+    for group in (*of_vehicle, calibrate, campaign, tune, film, keys, completion):
         group.add_parser(commands)
     words = "run the recorded inputs through the core again and compare every output to the bit"
     replay = commands.add_parser("replay", help=words, description=words.capitalize() + ".")
@@ -245,8 +254,10 @@ def _common(options: argparse.Namespace) -> list[str]:
 
 def _run_options(options: argparse.Namespace) -> list[str]:
     duration = getattr(options, "duration", None)
+    longest = getattr(options, "longest", None)
     quiet = ["--no-progress"] if options.no_progress else []
-    return [*quiet, *([] if duration is None else [f"--duration={duration}"])]
+    limits = [("duration", duration), ("longest", longest)]
+    return [*quiet, *(f"--{name}={value}" for name, value in limits if value is not None)]
 
 
 def _out(options: argparse.Namespace) -> Path:

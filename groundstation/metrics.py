@@ -213,6 +213,7 @@ def _contact(run: Run, window: Windows) -> dict[str, Any]:
         if truth is not None and touched
         else None,
         "bounces": len(gaps) if truth is not None and touched else None,
+        "longest_gap": max(gaps, default=0.0) if truth is not None and touched else None,
         "time_without_contact": float(sum(gaps)) if truth is not None and touched else None,
     }
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Generator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
@@ -316,12 +317,72 @@ _NO_SERVOS, _NO_POSE, _NO_ATTITUDE, _NO_FORCES = ((float("nan"),) * count for co
 TRUTH_LASTS = 0.05
 
 
+class Source(Protocol):
+    """What a run is told by, and what is known of it in the end."""
+
+    @property
+    def info(self) -> RunInfo:
+        """What the run was."""
+
+    @property
+    def config_yaml(self) -> str:
+        """All that was in force, as text."""
+
+    @property
+    def complete(self) -> bool:
+        """It was told to its end."""
+
+
 def read_run(path: Path, *, partial: bool = False) -> Run:
     """Read a whole log.
 
     Raises:
         LogError: it cannot be read, or holds no ticks.
     """
+    with LogReader(path, partial=partial) as log:
+        gathering = Gathering(path, log)
+        for topic, t_ns, message in log.timed(_KINDS):
+            gathering.take(topic, t_ns, message)
+        return gathering.end()
+
+
+class Gathering:
+    """A run, told message by message: those of a log, or of a flight in this process while it is flown."""
+
+    def __init__(self, path: Path, source: Source) -> None:
+        self._steps = _gather(path, source)
+        next(self._steps)
+
+    def take(self, topic: str, t_ns: int, message: Any) -> None:
+        """Take one message of a topic."""
+        self._steps.send((topic, t_ns, message))
+
+    def take_config(self, config: Struct) -> None:
+        """Take the parameters in force from now on, as the flight has them."""
+        self.take(PARAMS, 0, _Revision(msgspec.json.decode(msgspec.json.encode(config), type=RunConfig)))
+
+    def end(self) -> Run:
+        """All that was told. Raises LogError when there was no tick."""
+        try:
+            self._steps.send(None)
+        except StopIteration as end:
+            run: Run = end.value
+            return run
+        raise AssertionError("it ends when nothing more is told")
+
+
+_KINDS: dict[str, Any] = {
+    TICK: _Tick,
+    TRUTH: _Truth,
+    EVENT: Event,
+    TIMING: Timing,
+    DEVICES: DeviceReport,
+    PARAMS: _Revision,
+}
+
+
+def _gather(path: Path, log: Source) -> Generator[None, tuple[str, int, Any] | None, Run]:
+    """Take messages until None is sent."""
     ticks: list[float] = []
     phases: list[str] = []
     truths: list[float] = []
@@ -336,133 +397,125 @@ def read_run(path: Path, *, partial: bool = False) -> Run:
     config: RunConfig | None = None
     start_ns = 0
     nowhere = float("nan")
-    kinds: dict[str, Any] = {
-        TICK: _Tick,
-        TRUTH: _Truth,
-        EVENT: Event,
-        TIMING: Timing,
-        DEVICES: DeviceReport,
-        PARAMS: _Revision,
-    }
-    with LogReader(path, partial=partial) as log:
-        for topic, t_ns, message in log.timed(kinds):
-            if topic == TICK:
-                inputs, outputs = message.inputs, message.outputs
-                estimate, reference, control = outputs.estimate, outputs.reference, outputs.control
-                if not phases:
-                    start_ns = inputs.t_ns
-                phases.append(outputs.phase)
-                odometry, autopilot, servos = inputs.odometry, inputs.autopilot, inputs.servos
-                ticks += (
-                    message.index,
-                    (inputs.t_ns - start_ns) * 1e-9,
-                    *estimate.p_WB,
-                    *estimate.rpy,
-                    *estimate.joints,
-                    *reference.p,
-                    *control.attitude,
-                    *control.joints,
-                    reference.force,
-                    estimate.contact_force,
-                    reference.dispensing,
-                    estimate.payload,
-                    nowhere if odometry is None else (odometry.t_ns - start_ns) * 1e-9,
-                    nowhere if autopilot is None else (autopilot.t_ns - start_ns) * 1e-9,
-                    nowhere if servos is None else (servos.t_ns - start_ns) * 1e-9,
-                    estimate.age_odometry,
-                    estimate.age_autopilot,
-                    estimate.age_servos,
-                    outputs.autopilot.engage == "offboard",
-                    *(_NO_SERVOS if servos is None else (*servos.current, *servos.voltage)),
-                    *(_NO_SERVOS if servos is None else (*servos.temperature, *servos.error)),
-                    *(_NO_POSE if odometry is None else (odometry.confidence, odometry.reset_counter, *odometry.q_WB)),
-                    *(_NO_ATTITUDE if autopilot is None else autopilot.q_WB),
-                    (inputs.t_ns - inputs.link.heard_ns) * 1e-9 if inputs.link.commander else nowhere,
-                    inputs.link.present,
-                    estimate.in_contact,
-                    *_read_forces(estimate.forces),
-                )
-                if (name := inputs.link.commander) and name not in commanders[-1:]:
-                    commanders.append(name)
-                if autopilot is not None:
-                    landed = autopilot.landed
-            elif topic == TRUTH:
-                truth_ns.append(t_ns)
-                truths += (
-                    *message.p_WB,
-                    *message.q_WB,
-                    *message.joints,
-                    *message.joint_torque,
-                    *message.rotor_thrust,
-                    *message.tip_W,
-                    *message.needle_W,
-                    message.contact_force,
-                    message.contact_peak,
-                    message.tip_slip,
-                )
-                last = message
-                crashed = crashed or message.crashed
-            elif topic == EVENT:
-                events.append(message)
-            elif topic == TIMING:
-                timings.append(message)
-            elif topic == DEVICES:
-                devices.append(message)
-            elif config is None:
-                config = message.config
-        if not phases or config is None:
-            raise LogError(f"{path}: holds no cycle; the run ended before its first tick")
-        rows = np.array(ticks).reshape(len(phases), -1)
-        index = rows[:, 0].astype(np.int64)
-        punctuality = _by_tick(index, timings)
-        return Run(
-            path=path,
-            info=log.info,
-            config=config,
-            config_yaml=log.config_yaml,
-            complete=log.complete,
-            index=index,
-            t=rows[:, 1],
-            phase=np.array(phases),
-            p=rows[:, 2:5],
-            rpy=rows[:, 5:8],
-            joints=rows[:, 8:11],
-            p_ref=rows[:, 11:14],
-            attitude_ref=rows[:, 14:17],
-            joints_ref=rows[:, 17:20],
-            force_des=rows[:, 20],
-            force_est=rows[:, 21],
-            forces={} if np.isnan(rows[:, 64]).all() else dict(zip((*ESTIMATORS, FELT), rows[:, 64:69].T, strict=True)),
-            triggered=rows[:, 63] > 0,
-            alarm=rows[:, 69] > 0,
-            dispensing=rows[:, 22] > 0,
-            payload=rows[:, 23] > 0,
-            stamps=dict(zip(SOURCES, rows[:, 24:27].T, strict=True)),
-            ages=dict(zip(SOURCES, rows[:, 27:30].T, strict=True)),
-            landed=landed,
-            truth=_truths(truths, (np.array(truth_ns) - start_ns) * 1e-9, rows[:, 1], last, crashed)
-            if last is not None
-            else None,
-            offboard=rows[:, 30] > 0,
-            late=punctuality[:, 0],
-            busy=punctuality[:, 1],
-            sent=punctuality[:, 2],
-            health=Health(
-                current=rows[:, 31:36],
-                voltage=rows[:, 36:41],
-                temperature=rows[:, 41:46],
-                error=rows[:, 46:51],
-                confidence=rows[:, 51],
-                resets=rows[:, 52],
-                lean=_lean(rows[:, 53:57], rows[:, 57:61]),
-                link_age=rows[:, 61],
-                link_present=rows[:, 62] > 0,
-                commanders=tuple(commanders),
-            ),
-            devices=devices,
-            events=sorted(events, key=lambda event: event.t_ns),
-            start_ns=start_ns,
-        )
+    while (told := (yield)) is not None:
+        topic, t_ns, message = told
+        if topic == TICK:
+            inputs, outputs = message.inputs, message.outputs
+            estimate, reference, control = outputs.estimate, outputs.reference, outputs.control
+            if not phases:
+                start_ns = inputs.t_ns
+            phases.append(outputs.phase)
+            odometry, autopilot, servos = inputs.odometry, inputs.autopilot, inputs.servos
+            ticks += (
+                message.index,
+                (inputs.t_ns - start_ns) * 1e-9,
+                *estimate.p_WB,
+                *estimate.rpy,
+                *estimate.joints,
+                *reference.p,
+                *control.attitude,
+                *control.joints,
+                reference.force,
+                estimate.contact_force,
+                reference.dispensing,
+                estimate.payload,
+                nowhere if odometry is None else (odometry.t_ns - start_ns) * 1e-9,
+                nowhere if autopilot is None else (autopilot.t_ns - start_ns) * 1e-9,
+                nowhere if servos is None else (servos.t_ns - start_ns) * 1e-9,
+                estimate.age_odometry,
+                estimate.age_autopilot,
+                estimate.age_servos,
+                outputs.autopilot.engage == "offboard",
+                *(_NO_SERVOS if servos is None else (*servos.current, *servos.voltage)),
+                *(_NO_SERVOS if servos is None else (*servos.temperature, *servos.error)),
+                *(_NO_POSE if odometry is None else (odometry.confidence, odometry.reset_counter, *odometry.q_WB)),
+                *(_NO_ATTITUDE if autopilot is None else autopilot.q_WB),
+                (inputs.t_ns - inputs.link.heard_ns) * 1e-9 if inputs.link.commander else nowhere,
+                inputs.link.present,
+                estimate.in_contact,
+                *_read_forces(estimate.forces),
+            )
+            if (name := inputs.link.commander) and name not in commanders[-1:]:
+                commanders.append(name)
+            if autopilot is not None:
+                landed = autopilot.landed
+        elif topic == TRUTH:
+            truth_ns.append(t_ns)
+            truths += (
+                *message.p_WB,
+                *message.q_WB,
+                *message.joints,
+                *message.joint_torque,
+                *message.rotor_thrust,
+                *message.tip_W,
+                *message.needle_W,
+                message.contact_force,
+                message.contact_peak,
+                message.tip_slip,
+            )
+            last = message
+            crashed = crashed or message.crashed
+        elif topic == EVENT:
+            events.append(message)
+        elif topic == TIMING:
+            timings.append(message)
+        elif topic == DEVICES:
+            devices.append(message)
+        elif config is None:
+            config = message.config
+    if not phases or config is None:
+        raise LogError(f"{path}: holds no cycle; the run ended before its first tick")
+    rows = np.array(ticks).reshape(len(phases), -1)
+    index = rows[:, 0].astype(np.int64)
+    punctuality = _by_tick(index, timings)
+    return Run(
+        path=path,
+        info=log.info,
+        config=config,
+        config_yaml=log.config_yaml,
+        complete=log.complete,
+        index=index,
+        t=rows[:, 1],
+        phase=np.array(phases),
+        p=rows[:, 2:5],
+        rpy=rows[:, 5:8],
+        joints=rows[:, 8:11],
+        p_ref=rows[:, 11:14],
+        attitude_ref=rows[:, 14:17],
+        joints_ref=rows[:, 17:20],
+        force_des=rows[:, 20],
+        force_est=rows[:, 21],
+        forces={} if np.isnan(rows[:, 64]).all() else dict(zip((*ESTIMATORS, FELT), rows[:, 64:69].T, strict=True)),
+        triggered=rows[:, 63] > 0,
+        alarm=rows[:, 69] > 0,
+        dispensing=rows[:, 22] > 0,
+        payload=rows[:, 23] > 0,
+        stamps=dict(zip(SOURCES, rows[:, 24:27].T, strict=True)),
+        ages=dict(zip(SOURCES, rows[:, 27:30].T, strict=True)),
+        landed=landed,
+        truth=_truths(truths, (np.array(truth_ns) - start_ns) * 1e-9, rows[:, 1], last, crashed)
+        if last is not None
+        else None,
+        offboard=rows[:, 30] > 0,
+        late=punctuality[:, 0],
+        busy=punctuality[:, 1],
+        sent=punctuality[:, 2],
+        health=Health(
+            current=rows[:, 31:36],
+            voltage=rows[:, 36:41],
+            temperature=rows[:, 41:46],
+            error=rows[:, 46:51],
+            confidence=rows[:, 51],
+            resets=rows[:, 52],
+            lean=_lean(rows[:, 53:57], rows[:, 57:61]),
+            link_age=rows[:, 61],
+            link_present=rows[:, 62] > 0,
+            commanders=tuple(commanders),
+        ),
+        devices=devices,
+        events=sorted(events, key=lambda event: event.t_ns),
+        start_ns=start_ns,
+    )
 
 
 def _read_forces(told: _Forces | None) -> tuple[float, ...]:

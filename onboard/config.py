@@ -74,7 +74,7 @@ def load_config(
             errors.extend(error.errors)
             return None
 
-    scene = attempt(_scenario, scenario, directory, option)
+    scene = attempt(scenario_layer, scenario, directory, option)
     no_scene = len(errors)
     options = [layer for text in sets if (layer := attempt(_option, text))]
     no_options = len(errors) - no_scene
@@ -136,7 +136,8 @@ def _scenarios(directory: Path) -> dict[str, Path]:
     return {**whole, **_named_files(directory / "scenarios")}
 
 
-def _scenario(scenario: str, directory: Path, option: str) -> Layer:
+def scenario_layer(scenario: str, directory: Path = CONFIGS, option: str = "--scenario") -> Layer:
+    """What a scenario itself holds, by its name or from its file. Raises ConfigError."""
     if "/" in scenario or "\\" in scenario or scenario.endswith((".yaml", ".yml")):
         return read_yaml(Path(scenario))
     return _named("scenario", scenario, f"{option} {scenario}", _scenarios(directory), directory / "scenarios")

@@ -23,6 +23,7 @@ from onboard.agreement import Agreement
 from onboard.config import CONFIGS, Config
 from onboard.device_config import Kind
 from onboard.layers import ConfigError
+from sim_backend.faults import Faults
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
 from sim_backend.software_camera import SoftwareCamera
 from sim_backend.world import World
@@ -32,6 +33,7 @@ from sim_backend.world_messages import Camera, Look
 #: For the world to answer, s: it has told its address, so it moves.
 _WORLD_PATIENCE = 10.0
 _TELL_PERIOD = 0.1
+_NAMES = ("autopilot", "odometry", "servos")
 
 
 class DeviceSet:
@@ -63,6 +65,54 @@ def world_of(config: Config) -> World:
 def mock_devices(world: World) -> DeviceSet:
     """All devices in process, on the world's own time."""
     return DeviceSet(MockAutopilot(world), MockOdometry(world), MockServos(world))
+
+
+class SimulatedDevices(DeviceSet):
+    """Devices in process that may be spoilt by faults, and hear of the mission's phase for that."""
+
+    def __init__(
+        self,
+        autopilot: AutopilotDevice,
+        odometry: OdometryDevice,
+        servos: ServoDevice,
+        world: World,
+        faults: list[Faults],
+    ) -> None:
+        super().__init__(autopilot, odometry, servos)
+        self._world, self._faults = world, faults
+
+    def enter(self, phase: str) -> None:
+        """The mission is in this phase. May be told in every tick."""
+        for faults in self._faults:
+            faults.enter(phase, self._world.time)
+
+
+def simulated_devices(world: World, config: Config) -> SimulatedDevices:
+    """All devices in process, failing as ``config.faults`` says. Raises ConfigError for a fault that none can show."""
+    faults, seed, tracker = config.faults, config.seed, config.devices.odometry
+    struck = {fault.device for fault in faults}
+    if struck:
+        from sim_backend.faulty_devices import FaultyAutopilot, FaultyOdometry, FaultyServos
+    errors = [f"faults: no device {name!r}; there are: {', '.join(_NAMES)}" for name in sorted(struck - set(_NAMES))]
+    if errors:
+        raise ConfigError(errors)
+    autopilot: AutopilotDevice = MockAutopilot(world)
+    odometry: OdometryDevice = MockOdometry(world)
+    servos: ServoDevice = MockServos(world)
+    spoilt: list[Faults] = []
+    try:
+        if "autopilot" in struck:
+            autopilot = px4 = FaultyAutopilot(world, faults, seed)
+            spoilt.append(px4.faults)
+        if "odometry" in struck:
+            odometry = camera = FaultyOdometry(world, faults, tracker.mount, tracker.jump, tracker.silence, seed)
+            spoilt.append(camera.faults)
+        if "servos" in struck:
+            servos = bus = FaultyServos(world, faults, config.devices.servos, seed)
+            spoilt.append(bus.faults)
+    except ValueError as error:
+        raise ConfigError([f"faults: {error}"]) from error
+    return SimulatedDevices(autopilot, odometry, servos, world, spoilt)
 
 
 def parameter_file(settings: Px4Settings) -> Path:

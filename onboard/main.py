@@ -103,6 +103,7 @@ def _parser() -> argparse.ArgumentParser:
     for command in (sim, fly):
         command.add_argument("--out", type=Path, required=True, help="an existing or new run folder")
         command.add_argument("--no-progress", action="store_true")
+    sim.add_argument("--longest", type=float, metavar="SECONDS", help="of simulated time, then it is broken off")
     fly.add_argument("--mission", action="store_true", help="fly the whole mission once preflight passes, then end")
     fly.add_argument("--duration", type=float, metavar="SECONDS", help="then land")
     fly.add_argument("--attended", action="store_true", help="end in order when standard input closes")
@@ -135,16 +136,18 @@ def _folder(config: Config, out: Path) -> Path:
 def _sim(options: argparse.Namespace) -> int:
     from onboard import estimator_cost
     from onboard.core.derived import check_mission
+    from onboard.devices import simulated_devices, world_of
     from onboard.simulate import simulate
 
+    if options.longest is not None and not options.longest > 0.0:
+        raise ConfigError([f"--longest {options.longest:g}: must be above 0"])
     config = load_config(options.scenario, options.law, options.sets, options.seed)
-    if config.faults:
-        raise ConfigError(["faults: the devices of a simulated run are mocks, which have none; fly it on the desk"])
     check_mission(config)
+    simulated_devices(world_of(config), config)
     log = _folder(config, options.out)
     progress = Progress(not options.no_progress and sys.stderr.isatty())
     try:
-        simulate(config, log, progress)
+        simulate(config, log, progress, options.longest)
     finally:
         progress.close()
     estimator_cost.write(config, log)

@@ -42,15 +42,12 @@ from sim_backend.motors import rated_voltage
 from sim_backend.pace import Pace
 from sim_backend.px4_commander import Commander, Severity
 from sim_backend.px4_estimator import PositionEstimator
+from sim_backend.px4_faults import DEVICE, KINDS
 from sim_backend.px4_link import Address, Link
 from sim_backend.px4_parameters import Parameters
 from sim_backend.px4_streams import MODES, Streams
 from sim_backend.world import World
 
-DEVICE = "autopilot"
-KINDS = (
-    Kind.DROP, Kind.DELAY, Kind.CORRUPT, Kind.FREEZE, Kind.NAN, Kind.SILENT, Kind.UNPLUGGED, Kind.REBOOT,
-)  # fmt: skip
 _SYSTEM, _AUTOPILOT = 1, 1
 _TEXT_CHUNK = 50
 _GROUND_STATION_LOST = 2.5  # s

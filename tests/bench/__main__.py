@@ -11,7 +11,7 @@ import msgspec
 
 from onboard.config import load_config
 from onboard.layers import ConfigError
-from tests.bench import compare, core, desk, flight, lateness, servos, setpoints
+from tests.bench import compare, core, desk, flight, lateness, servos, setpoints, throughput, worlds
 from tests.bench.emergency import measure
 from tests.bench.report import Report, conditions
 from tests.bench.table import table
@@ -27,12 +27,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--longest", type=float, metavar="S", help="break the mission off after S simulated seconds")
     parser.add_argument("--cycles", type=int, default=1000, metavar="N", help="of each of the rows in real time")
     parser.add_argument("--trials", type=int, default=1000, metavar="N", help="of the emergency stop; 0 leaves it out")
+    parser.add_argument("--runs", type=int, default=12, metavar="N", help="of the campaign; 0 leaves it out")
     parser.add_argument("--no-desk", action="store_true", help="leave out the flight in real time")
     given = parser.parse_args(arguments)
     if not 40 <= given.cycles <= 100_000:
         parser.error(f"--cycles {given.cycles}: from 40 to 100000")
     if given.trials and not 10 <= given.trials <= 100_000:
         parser.error(f"--trials {given.trials}: 0, or from 10 to 100000")
+    if not 0 <= given.runs <= 1000:
+        parser.error(f"--runs {given.runs}: from 0 to 1000")
     if given.longest is not None and not 1.0 <= given.longest <= 900.0:
         parser.error(f"--longest {given.longest:g}: from 1 to 900 s")
     try:
@@ -64,6 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         setpoints.measure(given.cycles),
         lateness.measure(ticks[: given.cycles], config),
         measure.measure(given.trials) if given.trials else None,
+        worlds.measure(config),
+        throughput.measure(given.runs) if given.runs else None,
         flown_in_real_time,
     )
     given.json.write_bytes(msgspec.json.format(msgspec.json.encode(report)) + b"\n")

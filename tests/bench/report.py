@@ -17,6 +17,8 @@ from tests.bench.flight import Flight
 from tests.bench.lateness import Lateness
 from tests.bench.servos import ServoCycle
 from tests.bench.setpoints import SetPoints
+from tests.bench.throughput import Throughput
+from tests.bench.worlds import Worlds
 
 #: What a desk core must reach in the median, so that a Jetson Nano holds 250 Hz, us.
 TARGET_US = 150
@@ -35,6 +37,8 @@ class Report(Struct, frozen=True):
     setpoints: SetPoints
     lateness: Lateness
     emergency: Emergency | None
+    worlds: Worlds
+    throughput: Throughput | None
     desk: Desk | None
     """None when they were left out."""
 

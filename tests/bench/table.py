@@ -9,6 +9,8 @@ from tests.bench.emergency.stations import PATIENCE
 from tests.bench.flight import Flight
 from tests.bench.measure import Stat
 from tests.bench.report import TARGET_US, Report
+from tests.bench.throughput import TARGET, Throughput
+from tests.bench.worlds import Worlds
 
 WIDTH = 100
 _NAME, _BAR = 32, 30
@@ -19,6 +21,9 @@ def table(report: Report) -> str:
     """All of a report, section by section."""
     parts = (_conditions, _core, _mission, _other_world, _comparisons, _real_time)
     lines = [line for part in parts for line in part(report)]
+    lines += _worlds(report.worlds)
+    if report.throughput is not None:
+        lines += _throughput(report.throughput)
     if report.emergency is not None:
         lines += emergency_rows(report.emergency)
     return "\n".join(lines if report.desk is None else [*lines, *desk_rows(report.desk)])
@@ -130,6 +135,26 @@ def _real_time(report: Report) -> list[str]:
     lines.append(_line("bare timer, lateness", late.bare, f"{1.0:>11.1f}"))
     lines.append(_line("  the loop with the core", late.loop, f"{late.ratio:>11.1f}"))
     return lines
+
+
+def _worlds(worlds: Worlds) -> list[str]:
+    lines = _head("Physics of one core", "steps/s", "step us", "ratio")
+    lines.append(f"{'rigid-body world, ours':<{_NAME}}{worlds.ours:>11,.0f}{1e6 * worlds.step:>11.0f}{1.0:>11.1f}")
+    if worlds.theirs_same is None or worlds.theirs_own is None:
+        return [*lines, f"  {worlds.package}"]
+    for rate, step in ((worlds.theirs_same, worlds.step), (worlds.theirs_own, 0.010)):
+        ratio = worlds.ours / rate
+        lines.append(f"{f'  {worlds.package}':<{_NAME}}{rate:>11,.0f}{1e6 * step:>11.0f}{ratio:>11.1f}")
+    return [*lines, "    (its multirotor alone; ours has arm, contact, motors, servos and the autopilot's loops)"]
+
+
+def _throughput(told: Throughput) -> list[str]:
+    lines = _head(f"Campaign, {told.runs} runs of {told.sim_s:g} s", "wall s", "x real", "ratio")
+    whole = told.runs * told.sim_s
+    verdict = "met" if told.ratio >= TARGET else "MISSED"
+    lines.append(f"{'one worker':<{_NAME}}{told.one:>11.2f}{whole / told.one:>11.1f}{1.0:>11.2f}")
+    row = f"{'two workers':<{_NAME}}{told.two:>11.2f}{told.speed:>11.1f}{told.ratio:>11.2f}"
+    return [*lines, f"{row}   target {TARGET:g}: {verdict}"]
 
 
 def emergency_rows(emergency: Emergency) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 
 from onboard.core.types import Action, Phase
-from sim_backend.px4_emulator import KINDS
+from sim_backend.px4_faults import KINDS
 from tests.process.book import PATIENT_BUS, Book, again, down, lands, strikes
 from tests.process.flying import Flying
 from tests.realtime import REALTIME
