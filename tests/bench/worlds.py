@@ -43,7 +43,7 @@ class Worlds(Struct, frozen=True):
 
 def measure(config: Config) -> Worlds:
     """Time both, in turns; the best of a few rounds each."""
-    world, step = world_of(config), config.world.plant.step
+    world, step = world_of(config), config.world.plant.physics_step
     other = _Other.made()
     ours, same, own = 0.0, 0.0, 0.0
     for _ in range(_ROUNDS):
