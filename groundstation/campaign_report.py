@@ -161,12 +161,13 @@ def _distributions(summary: Summary, table: pa.Table) -> Iterator[str]:
             continue
         values = column(table, figure.name)
         counts, edges = np.histogram(values[np.isfinite(values)], bins=min(_BINS, max(6, spread.count // 4)))
-        chart = Chart(figure.words, "runs", (float(edges[0]), float(edges[-1])), y=(0.0, 1.1 * float(counts.max())),
+        title = f"{figure.words} (median {spread.median:.3g})"
+        chart = Chart(title, "runs", (float(edges[0]), float(edges[-1])), y=(0.0, 1.1 * float(counts.max())),
                       x_label=f"{figure.name}{f', {figure.unit}' if figure.unit else ''}", height=200)  # fmt: skip
         for k, number in enumerate(counts.tolist()):
             low, high = float(edges[k]), float(edges[k + 1])
             chart.bar(low, high, float(number), f"{number} runs from {low:.4g} to {high:.4g}")
-        chart.mark(spread.median, f"median {spread.median:.3g}")
+        chart.mark(spread.median, "")
         yield f"<div>{chart.svg()}</div>"
     yield '</div><details><summary>as numbers</summary><table><tr><th>figure</th><th>unit</th><th class="n">runs</th>'
     yield (

@@ -57,8 +57,8 @@ NAMES: Final = tuple(figure.name for figure in FIGURES)
 
 #: How a run can end, from well to worse.
 ENDS: Final = {
-    "completed": "sleeve installed and landed, as planned",
-    "resumed": "sleeve installed and landed, after a hold or a retreat",
+    "completed": "sleeve installed and landed, without a retreat",
+    "resumed": "sleeve installed and landed, after a retreat",
     "landed": "landed early, under its own control",
     "autolanded": "landed early by the autopilot itself",
     "grounded": "never left the ground",

@@ -26,6 +26,7 @@ from onboard.records import EVENT, PARAMS, TICK, TRUTH, Revision, RunInfo, Timin
 from onboard.simulate import fly as fly_mission
 from onboard.simulate import run_info
 from sim_backend.plant import Truth
+from sim_backend.world import World
 
 __all__ = [
     "ConfigError",
@@ -76,7 +77,8 @@ class Mission:
         self.config: Config = load_config(scenario, law, sets, seed)
         check_mission(self.config)
         try:
-            simulated_devices(world_of(self.config), self.config)
+            self._world: World | None = world_of(self.config)
+            simulated_devices(self._world, self.config)
         except ValueError as error:  # parameters of the world that do not go together
             raise ConfigError([f"world: {error}"]) from error
 
@@ -95,14 +97,16 @@ class Mission:
         return find(self.config, [name])[0].value
 
     def fly(self, hear: Hear, longest: float | None = None, wall_s: float | None = None) -> None:
-        """Fly it to its end; longest: s of simulated time; wall_s: of the wall clock, else TookTooLongError."""
+        """Fly it to its end, once; longest: s of simulated time; wall_s: of the wall clock, else TookTooLongError."""
+        world, self._world = self._world, None
+        assert world is not None, "a world ages: the next flight needs a mission of its own"
         until = None if wall_s is None else time.monotonic() + wall_s
 
         def watch(outputs: Outputs, t: float) -> None:
             if until is not None and time.monotonic() > until:
                 raise TookTooLongError(f"{t:.1f} s flown in {wall_s:g} s of wall clock, in {outputs.phase.value}")
 
-        fly_mission(self.config, world_of(self.config), _Told(hear, self.config), watch, longest)
+        fly_mission(self.config, world, _Told(hear, self.config), watch, longest)
 
 
 class _Told:
