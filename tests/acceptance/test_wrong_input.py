@@ -41,7 +41,7 @@ def refused(folder: Path, *arguments: str, lines: int = 1) -> str:
         ("--set=pipe.position=[2,0,0.3]", ["pipe.position z = 0.3 m", "at least 0.62 m is needed"]),
         ("--set=pipe.position=[30,0,1.5]", ["outside of the fence", "safety.fence_high (10.0, 10.0, 6.0)"]),
         ("--law=tund", ["no law of the name 'tund'", "tuned, paper"]),
-        ("--scenario=papr", ["no scenario of the name 'papr'", "paper, desk"]),
+        ("--scenario=papr", ["no scenario of the name 'papr'", "paper, realistic, desk"]),
         ("--scenario=none.yaml", ["none.yaml: cannot be read", "No such file"]),
     ],
 )
