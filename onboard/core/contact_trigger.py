@@ -24,6 +24,9 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     tolerance: Annotated[float, spec("m", 0.001, 0.5, "distance of the tip from the crack")] = 0.03
     threshold: Annotated[float, spec("N", 0.01, 3.0, "estimated compressive force that means contact")] = 0.15
     debounce: Annotated[float, spec("s", 0.0, 2.0, "how long both must hold")] = 0.10
+    height: Annotated[
+        float, spec("m", 0.005, 0.1, "tip above or below the crack at which it is slipping off the pipe, in the press")
+    ] = 0.04
     lost_force: Annotated[float, spec("N", -1.0, 3.0, "estimated force below which contact is doubtful")] = 0.05
     lost_time: Annotated[float, spec("s", 0.0, 5.0, "how long it must stay below")] = 0.5
     short_share: Annotated[float, spec("1", 0.0, 0.9, "share of the desired force that is far too little")] = 0.4

@@ -89,6 +89,7 @@ def step(
         flying,
         near_pipe,
         reference.force_ahead,
+        estimate.forces.wind,
         params.backstepping,
         dt,
     )

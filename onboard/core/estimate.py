@@ -14,7 +14,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from drivers.samples import AutopilotState, Odometry, ServoState, Vec3
-from onboard.core import contact_trigger, estimators, kinematics, math3
+from onboard.core import contact_trigger, estimators, kinematics, math3, plan
 from onboard.core.derived import Derived
 from onboard.core.guidance import Progress
 from onboard.core.kinematics import Tool
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from onboard.core.params import Params as AllParams
 
 NEAR_PIPE = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE)
+#: On the way out of contact.
+LEAVING = (Phase.ALIGN, Phase.TARE, Phase.RETREAT, Phase.RETREAT_HOLD, Phase.RETREAT_LAND)
 ON_GROUND = (Phase.PREFLIGHT, Phase.ARMED, Phase.STOPPED)
 FREE_FLIGHT = (Phase.APPROACH, Phase.ALIGN, Phase.ADHESIVE, Phase.TOOL_CHANGE, Phase.TARE, Phase.RETURN, Phase.HOLD)
 
@@ -35,6 +37,10 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     extrapolate_max: Annotated[
         float, spec("s", 0.0, 0.2, "position is carried forward by velocity for at most this age")
     ] = 0.06
+    jump: Annotated[
+        float,
+        spec("m", 0.003, 1.0, "a step of the tracker beyond what its velocity explains from which it is no motion"),
+    ] = 0.01
     released_at: Annotated[
         float, spec("rad", -3.14, 3.14, "measured gripper angle beyond which the sleeve is gone")
     ] = 0.8
@@ -61,6 +67,8 @@ class State(Struct, frozen=True, gc=False):
     """What takes a position of the tracker back into the frame it had before it jumped, m."""
     alarm: contact_trigger.State = contact_trigger.State()
     """Away from the pipe: the trigger, as if the tip were at the crack."""
+    near: bool = False
+    """There may be contact: the gate of the estimators is open."""
 
 
 def step(
@@ -90,7 +98,7 @@ def step(
             jump = hypot(*leap)
             reset = new.reset_counter != odometry.reset_counter
             brief = new.t_ns - odometry.t_ns <= params.estimate.extrapolate_max * 1e9
-            if brief and phase is not Phase.PREFLIGHT and (reset or jump > params.safety.odometry_jump):
+            if brief and phase is not Phase.PREFLIGHT and (reset or jump > params.estimate.jump):
                 shift = (shift[0] - leap[0], shift[1] - leap[1], shift[2] - leap[2])
             odometry = new
     told = inputs.autopilot
@@ -116,7 +124,7 @@ def step(
         estimate = _nothing(state.payload, ages)
         waiting = State(
             odometry, autopilot, servos, state.forces, state.trigger, state.payload,
-            finite, jump, reset, disagreement, shift, state.alarm,
+            finite, jump, reset, disagreement, shift, state.alarm, state.near,
         )  # fmt: skip
         return waiting, estimate
 
@@ -140,13 +148,21 @@ def step(
     )
 
     tip = kinematics.tip_W(vehicle.arm, p, R, joints, Tool.NEEDLE if phase is Phase.ADHESIVE else Tool.GRIPPER)
-    at_pipe, crack = phase in NEAR_PIPE, site.crack
-    distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
+    at_pipe, crack = phase in NEAR_PIPE or progress.feeling, plan.found(site, progress.along).crack
+    if progress.feeling:  # how far it is ahead is what is looked for, and the pipe is long
+        distance = abs(tip[2] - crack[2])
+    else:
+        distance = hypot(tip[0] - crack[0], tip[1] - crack[1], tip[2] - crack[2])
     rpy_rate = math3.euler_rates_from_body(rpy, w)
+    near = distance < params.estimators.gate
+    if not at_pipe:  # whoever leaves the pipe touches it for a while yet: what presses then is no wind to lean against
+        n = site.normal
+        clear = (crack[0] - tip[0]) * n[0] + (crack[1] - tip[1]) * n[1]
+        near = state.near and phase in LEAVING and clear < 0.5 * params.estimators.gate
     sight = estimators.Sight(
         autopilot.f_B, acceleration, v, ahead, odometry is not state.odometry, R, p, rpy, rpy_rate, servos, ages[2],
-        payload, reference.a if reference is not None else _O, at_pipe and distance < params.estimators.gate,
-        progress.arrived and not at_pipe,
+        payload, reference.a if reference is not None else _O, near,
+        (progress.arrived or progress.taring) and not at_pipe,
     )  # fmt: skip
     dropped = not progress.tare_begun
     watched, forces = estimators.step(
@@ -178,7 +194,7 @@ def step(
         x, y, z = math3.vertical(odometry.q_WB)
         disagreement = acos(min(1.0, max(-1.0, x * R[6] + y * R[7] + z * R[8])))
     return State(
-        odometry, autopilot, servos, watched, trigger, payload, finite, jump, reset, disagreement, shift, alarm
+        odometry, autopilot, servos, watched, trigger, payload, finite, jump, reset, disagreement, shift, alarm, near
     ), estimate
 
 

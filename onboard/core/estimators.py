@@ -133,9 +133,10 @@ def step(
         kalman.force, four.tare, kalman.contact, felt, R, derived.site.normal,
     )  # fmt: skip
     f1, f2, f3, f4, (c1, c2, c3, c4, c5) = read
+    wind = math3.subtract(kalman.force, kalman.contact)
     return (
         State(thrust, paper, body, momentum, kalman, tares, joints, felt),
-        Forces(Force(f1, c1), Force(f2, c2), Force(f3, c3), Force(f4, c4), c5, thrust.scale),
+        Forces(Force(f1, c1), Force(f2, c2), Force(f3, c3), Force(f4, c4), c5, wind, thrust.scale),
     )
 
 

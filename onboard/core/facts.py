@@ -115,9 +115,10 @@ def for_mission(
     told = seen.autopilot
     armed = told is not None and told.armed
     grounded = told is not None and told.landed is Landed.ON_GROUND
-    site = derived.site
+    site, contact = derived.site, params.contact
     crack, tip, n = site.crack, believed.tip_W, site.normal
-    beyond = (tip[0] - crack[0]) * n[0] + (tip[1] - crack[1]) * n[1]
+    beyond = (tip[0] - crack[0]) * n[0] + (tip[1] - crack[1]) * n[1] - progress.along
+    aside, up = abs((tip[1] - crack[1]) * n[0] - (tip[0] - crack[0]) * n[1]), tip[2] - crack[2]
     adrift = believed.age_autopilot > params.safety.autopilot_lost
     return mission.Facts(
         ready=believed.valid and grounded and not armed and not verdict.reasons,
@@ -131,8 +132,12 @@ def for_mission(
         landed=grounded and not flying,
         disarmed=not armed,
         in_contact=believed.in_contact,
-        contact_lost=phase is Phase.PRESS and not believed.in_contact,
-        overtravel=phase is Phase.ADVANCE and beyond > params.plan.overtravel,
+        contact_lost=phase is Phase.PRESS
+        # where the tip is off the crack, pushing on would not find it, but lead past the pipe
+        and (
+            abs(up) > contact.height or (not believed.in_contact and (progress.lost or aside > 2.0 * contact.tolerance))
+        ),
+        overtravel=progress.missed or (phase is Phase.ADVANCE and beyond > params.plan.overtravel),
         blind=safety.blind(verdict),
         offboard_lost=safety.yielded(verdict),
         payload=believed.payload,

@@ -40,6 +40,8 @@ SMOOTH_START = 1.0
 LAST_DESCENT = 0.35
 #: The advance goes on this far past the overtravel that ends it, m.
 BEYOND = 0.02
+#: Contact that is lost is looked for from no farther ahead of the vehicle, m.
+NOT_FAR = 0.03
 #: An estimate this long (s) after the retreat has begun tells whether there is contact.
 SHORTEST_EASE = 0.05
 #: Touched down: the reference is this far below the vehicle (m), which sinks no faster than this (m/s).
@@ -67,6 +69,13 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     gripper_open: Annotated[float, spec("rad", -3.14, 3.14, "gripper servo angle that lets it go", in_flight=False)] = (
         1.0
     )
+    seek_time: Annotated[
+        float,
+        spec(
+            "s", 0.0, 10.0, "contact lost in the press: looked for at once and for so long; 0: never", in_flight=False
+        ),
+    ] = 0.0
+    seek_speed: Annotated[float, spec("m/s", 0.002, 0.1, "speed with which it is looked for")] = 0.02
     stop_acceleration: Annotated[float, spec("m/s^2", 0.1, 3.0, "mean deceleration of a broken-off motion")] = 0.5
 
 
@@ -105,6 +114,12 @@ class State(Struct, frozen=True, gc=False):
     """Time since the gripper was seen open, s."""
     tare: bool = False
     """Hovering, a tare was asked for."""
+    along: float = 0.0
+    """So much farther along the contact normal is the pipe than the mission believes, m."""
+    felt: bool = False
+    """It was found by touch."""
+    seeking: float = -1.0
+    """Pressing: time since contact was lost and is being looked for, s; negative when it is not."""
 
 
 class Progress(Struct, frozen=True, gc=False):
@@ -119,6 +134,14 @@ class Progress(Struct, frozen=True, gc=False):
     tared: bool = False
     grounded: bool = False
     """Landing: the motors have been spooled down."""
+    feeling: bool = False
+    """The tip moves on until it touches the pipe, wherever that is."""
+    missed: bool = False
+    """It has come to the end of its way without a touch."""
+    along: float = 0.0
+    """So much farther along the contact normal is the pipe than the mission believes, m."""
+    lost: bool = True
+    """Contact that is lost is lost for good: it is not, or no longer, looked for."""
 
 
 def initial() -> State:
@@ -160,11 +183,12 @@ def step(
     tare: hovering, a tare was asked for; engaged: the autopilot follows our set-points; pump: measured angle of the
     pump servo, rad.
     """
-    own, site = params.guidance, derived.site
+    own, site = params.guidance, plan.found(derived.site, state.along)
     if not estimate.valid:
         return state, _reference(state, params, 0.0, 0.0, False), Progress()
     if phase is not state.phase:
         state = _enter(state, phase, estimate, pump, derived, params)
+        site = plan.found(derived.site, state.along)
     if phase in STANDING:
         here: Eight = (*measured(estimate, pump, params.vehicle)[:4], *state.at[4:])
         state = replace(state, at=here, home=here)
@@ -182,9 +206,27 @@ def step(
     if phase is Phase.LAND and _touched_down(state, estimate):
         lift = max(0.0, lift - dt / params.plan.spool)
 
-    force, ahead, pressing, pressed = 0.0, 0.0, phase in PRESSING, False
+    seeking = state.seeking
+    if phase is Phase.PRESS and own.seek_time > 0.0:
+        if seeking >= 0.0:
+            seeking += dt
+            if estimate.in_contact:
+                state, seeking = _press(state, estimate, derived, params), -1.0
+        elif not estimate.in_contact:
+            state, seeking = _seek(state, estimate, site, params), 0.0
+    elif phase is not Phase.PRESS:
+        seeking = -1.0
+    leg = state.legs[state.index] if state.index < len(state.legs) else None
+    if leg is not None and leg.feeling and estimate.in_contact:
+        state = replace(
+            _start_from(state, _base_measured(state.at, estimate)), along=_along(estimate, derived), felt=True
+        )
+        site = plan.found(derived.site, state.along)
+        state = replace(state, legs=_plan(phase, state, site, params))
+
+    force, ahead, pressing, pressed = 0.0, 0.0, phase in PRESSING and seeking < 0.0, False
     press_time, lead = state.press_time, params.force_profile.lead
-    if phase is Phase.PRESS:
+    if phase is Phase.PRESS and seeking < 0.0:
         press_time += dt
         force, pressed = _profile(press_time, state, params)
         ahead, _ = _profile(press_time + lead, state, params)
@@ -230,19 +272,28 @@ def step(
         phase, state.legs, state.index, state.time, state.start, state.start_rate, state.start_acceleration,
         state.moving,
         state.at, state.rate, state.acceleration, state.home, settled, clock, lift, press_time, state.press_start,
-        force, easing, compliant, released_for, tare,
+        force, easing, compliant, released_for, tare, state.along, state.felt, seeking,
     )  # fmt: skip
     arrived = ended and easing < 0.0 and settled >= own.settle_time and lift >= 1.0
     tare_begun = tare or phase is Phase.TARE
     taring = tare_begun and arrived and clock >= own.tare_settle
+    tared = taring and clock >= own.tare_settle + own.tare_time
+    leg = state.legs[state.index] if not ended else None
+    if leg is not None and leg.taring:
+        tare_begun, taring = True, state.time >= own.tare_settle
+        tared = state.time + dt >= leg.duration
     progress = Progress(
         arrived,
         pressed,
         released_for >= own.release_hold,
         tare_begun,
         taring,
-        taring and clock >= own.tare_settle + own.tare_time,
+        tared,
         phase is Phase.LAND and lift <= 0.0,
+        leg is not None and leg.feeling,
+        ended and bool(state.legs) and state.legs[-1].feeling,
+        state.along,
+        own.seek_time <= 0.0 or seeking > own.seek_time,
     )
     return state, _reference(state, params, acceleration, ahead, pressing), progress
 
@@ -279,7 +330,7 @@ def _reference(state: State, params: AllParams, compliant: float, force_ahead: f
 
 def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived: Derived, params: AllParams) -> State:
     """The state with the plan of ``phase``, begun where the reference is."""
-    before, site = state.phase, derived.site
+    before, site = state.phase, plan.found(derived.site, state.along)
     if phase in STANDING:
         # nothing of the last flight is left but the gripper, which stays open until the next preflight
         released_for = state.released_for if phase is Phase.STOPPED else 0.0
@@ -290,14 +341,8 @@ def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived:
     force = state.force
     easing = -1.0
     if phase is Phase.PRESS:
-        # the translation law pushes as it did at the trigger: with what it feeds forward, and an offset for the rest
-        push = min(max(0.0, estimate.contact_force), params.repair.force)
-        lead = (1.0 - params.backstepping.feed_forward) * push / derived.normal_stiffness
-        n = site.normal
-        at = _base_measured(state.at, estimate)
-        state = _start_from(state, (at[0] + lead * n[0], at[1] + lead * n[1], *at[2:]))
-        state = replace(state, press_time=0.0, press_start=push, admittance=admittance.State())
-        force = push
+        state = _press(state, estimate, derived, params)
+        force = state.press_start
     elif phase is not Phase.RELEASE:
         if phase in BACKING_OUT and state.easing >= 0.0:
             easing = state.easing  # one retreat turns into another: the force goes on being taken back
@@ -323,6 +368,37 @@ def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived:
     if state.moving and legs and legs[0].duration < stop:
         legs = (replace(legs[0], duration=stop), *legs[1:])  # a short leg must not make the way out of motion hard
     return replace(state, legs=legs)
+
+
+def _press(state: State, estimate: Estimate, derived: Derived, params: AllParams) -> State:
+    """The state with the force loop closed where contact was felt."""
+    # the translation law pushes as it did at the trigger: with what it feeds forward, and an offset for the rest
+    push = min(max(0.0, estimate.contact_force), params.repair.force)
+    lead = (1.0 - params.backstepping.feed_forward) * push / derived.normal_stiffness
+    n = derived.site.normal
+    at = _base_measured(state.at, estimate)
+    state = _start_from(state, (at[0] + lead * n[0], at[1] + lead * n[1], *at[2:]))
+    along = _along(estimate, derived) if params.plan.feel else state.along
+    return replace(state, legs=(), press_time=0.0, press_start=push, admittance=admittance.State(), along=along)
+
+
+def _seek(state: State, estimate: Estimate, site: Site, params: AllParams) -> State:
+    """The state with the tip on its way back to the pipe, which is where it was felt last."""
+    tip, (nx, ny), at = estimate.tip_W, site.normal, _base_measured(state.at, estimate)
+    gap = min(NOT_FAR, max(0.0, (site.crack[0] - tip[0]) * nx + (site.crack[1] - tip[1]) * ny))
+    state = _start_from(state, (at[0] + gap * nx, at[1] + gap * ny, *at[2:]))
+    speed = params.guidance.seek_speed
+    way = speed * (params.guidance.seek_time + SMOOTH_START)
+    aside = (site.crack[0] - at[0]) * -ny + (site.crack[1] - at[1]) * nx  # back to the crack's middle
+    leg = _uniform(state.at, (way * nx, way * ny, 0.0), speed)
+    x, y, *rest = leg.target
+    return replace(state, legs=(replace(leg, target=(x - aside * ny, y + aside * nx, *rest)),))
+
+
+def _along(estimate: Estimate, derived: Derived) -> float:
+    """How far the tip is beyond the crack that the mission believes, along the contact normal, m."""
+    tip, crack, n = estimate.tip_W, derived.site.crack, derived.site.normal
+    return (tip[0] - crack[0]) * n[0] + (tip[1] - crack[1]) * n[1]
 
 
 def _stop_time(state: State, params: AllParams) -> float:
@@ -356,8 +432,13 @@ def _plan(phase: Phase, state: State, site: Site, params: AllParams) -> tuple[Le
         for point in plan.route(at, plan.beside(site, site.far), params.pipe, site, p):
             path.to(base=point, arm=ready)
     elif phase is Phase.ALIGN:
-        _arm_first(path, ready, plan.beside(site, site.needle))
-        path.to(yaw=site.yaw).to(base=plan.beside(site, site.needle), slow=True)
+        if p.feel and not state.felt:
+            _feel(path, site, params)
+        else:
+            if p.feel:  # back from the pipe first, to where the arm may move
+                path.to(base=plan.beside(site, site.near - p.gap + p.feel_room), slow=True)
+            _arm_first(path, ready, plan.beside(site, site.needle))
+            path.to(yaw=site.yaw).to(base=plan.beside(site, site.needle), slow=True)
     elif phase is Phase.ADHESIVE:
         if at[:3] != plan.beside(site, site.needle):
             _arm_first(path, ready, plan.beside(site, site.needle))
@@ -394,6 +475,17 @@ def _arm_first(path: Path, arm: tuple[float, float, float], base: Vec3) -> None:
     """Away from ``base``, beside the pipe, bring the arm into the pose in which it may come there."""
     if path.at[:3] != base and path.at[4:7] != arm:
         path.to(arm=arm)
+
+
+def _feel(path: Path, site: Site, params: AllParams) -> None:
+    """To the pipe with the gripper ahead; at rest before it the observers are tared, then on until it is felt."""
+    p, own = params.plan, params.guidance
+    room = plan.beside(site, site.near - p.gap + p.feel_room)
+    path.to(yaw=site.yaw, arm=(p.press_reach, 0.0, 0.0)).to(base=room, slow=True)
+    path.add(Leg(path.at, own.tare_settle + own.tare_time, taring=True))
+    way, n = p.feel_room + p.overtravel, site.normal
+    leg = _uniform(path.at, (way * n[0], way * n[1], 0.0), p.feel_speed)
+    path.add(replace(leg, feeling=True))
 
 
 def _adhesive(path: Path, site: Site, params: AllParams) -> None:

@@ -15,8 +15,8 @@ wins.
   was interrupted beside the pipe, to what is done there. Whoever is not clear of the pipe retreats first.
 - ARMED is on the ground: whatever breaks it off leads through LAND, which disarms, as a takeoff broken off does.
 - Lost contact in PRESS goes back to TARE (the reference backs off, the observer is tared anew) and presses again;
-  after ``max_attempts`` of these, or when ADVANCE finds no contact in time or in reach, the mission gives up: it
-  retreats, returns and lands, and does not count as completed.
+  after ``max_attempts`` of these, or when ADVANCE (or ALIGN, feeling for the pipe) finds no contact in reach, the
+  mission gives up: it retreats, returns and lands, and does not count as completed.
 - The autopilot lands by itself (``State.autoland``) when the position is lost or LAND takes too long. Once it has
   left offboard by itself, or a pilot has taken it (``State.yielded``), nothing is asked of it any more but KILL.
 """
@@ -533,7 +533,7 @@ TABLE: Final[tuple[Row, ...]] = (
     Row((P.TOOL_CHANGE,), _FACTS, arrived, P.TARE, "tare"),
     Row((P.TARE,), _FACTS, tared, P.ADVANCE, "advance"),
     Row((P.ADVANCE,), _FACTS, triggered, P.PRESS, "press"),
-    Row((P.ADVANCE,), _FACTS, overtravel, P.RETREAT_HOLD, "no_contact", _GIVE_UP),
+    Row((P.ALIGN, P.ADVANCE), _FACTS, overtravel, P.RETREAT_HOLD, "no_contact", _GIVE_UP),
     Row((P.ADVANCE,), _FACTS, late, P.RETREAT_HOLD, "no_contact", _GIVE_UP),
     Row((P.PRESS,), _FACTS, lost_again, P.TARE, "press_again"),
     Row((P.PRESS,), _FACTS, lost_for_good, P.RETREAT_HOLD, "press_given_up", _GIVE_UP),

@@ -12,13 +12,14 @@ from math import cbrt, cos, hypot, inf, pi, radians, sin, sqrt
 from typing import Annotated
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from onboard.core import kinematics
 from onboard.core.math3 import wrap_angle
 from onboard.core.repair import Pipe
-from onboard.core.spec import spec
+from onboard.core.spec import note, spec
 
 Eight = tuple[float, float, float, float, float, float, float, float]
 
@@ -72,6 +73,9 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     overtravel: Annotated[float, spec("m", 0.01, 0.3, "advance past the crack before giving up", in_flight=False)] = (
         0.08
     )
+    feel: Annotated[bool, note("before the work, find out by touch how far the pipe is", in_flight=False)] = False
+    feel_room: Annotated[float, spec("m", 0.02, 0.3, "sleeve to crack where that begins", in_flight=False)] = 0.10
+    feel_speed: Annotated[float, spec("m/s", 0.002, 0.05, "speed with which it is felt for")] = 0.015
     descent_speed: Annotated[float, spec("m/s", 0.05, 1.0, "last part of the landing")] = 0.20
     yaw_rate: Annotated[float, spec("rad/s", 0.05, 2.0, "peak yaw rate")] = 0.5
     arm_speed: Annotated[float, spec("m/s", 0.01, 0.5, "peak speed of the wrist")] = 0.12
@@ -91,6 +95,10 @@ class Leg(Struct, frozen=True, gc=False):
     """Adhesive flows."""
     uniform: bool = False
     """Constant speed after a smooth start (the advance and the last descent), not rest to rest."""
+    taring: bool = False
+    """A rest, in whose last part the force observers are tared."""
+    feeling: bool = False
+    """The tip is to find the pipe: ends at the touch."""
 
 
 def duration(distance: float, speed: float, acceleration: float, jerk: float) -> float:
@@ -113,6 +121,14 @@ class Site(Struct, frozen=True, gc=False):
     """Base to crack: at the standoff, while dispensing, before the advance."""
     arc: tuple[float, float]
     """Reachable arc: first and last angle about the pipe's axis, rad; 0 faces the vehicle, positive is up."""
+
+
+def found(site: Site, along: float) -> Site:
+    """The site with the crack ``along`` m farther along the contact normal than the mission believes."""
+    if along == 0.0:
+        return site
+    (x, y, z), (nx, ny) = site.crack, site.normal
+    return replace(site, crack=(x + along * nx, y + along * ny, z))
 
 
 class InfeasibleError(ValueError):

@@ -58,7 +58,7 @@ def step(state: State, inputs: Inputs, params: Params, dt: float) -> tuple[State
         state.guidance, believed, task.phase, task.taring, known.engaged, _pump(seen), derived, params, dt
     )
     aloft = flying and reference.lift >= 1.0
-    at_pipe = task.phase in estimate.NEAR_PIPE
+    at_pipe = task.phase in estimate.NEAR_PIPE or progress.feeling
     joints, closed = facts.joint_drive(seen, believed, params)
     laws, wanted = control.step(state.control, believed, reference, aloft, at_pipe, closed, derived, params, dt)
     engage = mission.engage(task, known)

@@ -136,6 +136,8 @@ class Forces(Struct, frozen=True, gc=False):
     kalman: Force = Force()
     felt: float = 0.0
     """Compression that the joints' currents tell of, N."""
+    wind: Vec3 = (0.0, 0.0, 0.0)
+    """Disturbance that the Kalman filter tells apart from the contact, N, W."""
     thrust_scale: float = 1.0
     """Thrust in hover over the thrust commanded."""
     alarm: bool = False

@@ -33,10 +33,11 @@ def law(
     hold: bool = False,
     force: float = 0.0,
     params: Params = PRINTED,
+    wind: Vec3 = ZERO,
 ) -> tuple[State, Vec3, Vec3]:
     normal = (cos(heading), sin(heading))
     return backstepping.step(
-        state, error, rate, acceleration, MASS, WEIGHT, normal, contact, adapt, hold, force, params, DT
+        state, error, rate, acceleration, MASS, WEIGHT, normal, contact, adapt, hold, force, wind, params, DT
     )
 
 
@@ -50,6 +51,29 @@ def test_is_equations_2_and_3(error: Vec3, rate: Vec3, acceleration: Vec3, distu
         expected = acceleration[i] - alpha[i] * rate[i] - gamma[i] * e2 - error[i]
         assert v[i] == pytest.approx(expected, abs=1e-9)
         assert force[i] == pytest.approx(MASS * expected + disturbance[i] + (WEIGHT if i == 2 else 0.0), abs=1e-9)
+
+
+def test_the_wind_is_leant_against_as_it_is_observed() -> None:
+    params = Params(wind=0.5, wind_bandwidth=5.0, alpha=1.0, beta=0.0, beta_z=0.0)
+    state, wind = START, (0.4, -0.2, 0.3)
+    for _ in range(1000):
+        state, force, _ = law(state, wind=wind, params=params)
+    assert force == pytest.approx((-0.2, 0.1, WEIGHT), abs=1e-6)
+    off, force, _ = law(state, wind=wind, params=Params())
+    assert force == pytest.approx((0.0, 0.0, WEIGHT))
+    assert off.wind == state.wind
+
+
+def test_while_friction_holds_the_tip_nothing_is_learnt_across_the_normal() -> None:
+    params = Params(wind=1.0, grip=1.0)
+    error, wind = (0.0, 0.1, -0.1), (0.3, 0.3, 0.0)
+    held, _, _ = law(error=error, wind=wind, contact=1.0, hold=True, force=1.5, params=params)
+    assert held.disturbance == (0.0, 0.0, 0.0)
+    assert held.wind[0] > 0.0
+    assert held.wind[1] == 0.0
+    loose, _, _ = law(error=error, wind=wind, contact=1.0, hold=True, force=0.5, params=params)
+    assert loose.disturbance[1] < 0.0 < loose.disturbance[2]
+    assert loose.wind[1] > 0.0
 
 
 def test_adaptation_opposes_the_augmented_error_and_is_bounded() -> None:

@@ -180,7 +180,7 @@ def test_a_jump_is_measured_and_the_position_goes_on(leap: Vec3) -> None:
     there = (1.002 + leap[0], leap[1], 1.5 + leap[2])
     state, believed = flown(state, 1, p_WB=there)
     assert state.jump == pytest.approx(size, abs=1e-12)
-    carried = size > LIMITS.odometry_jump
+    carried = size > E.jump
     assert believed.p_WB == pytest.approx((1.002, 0.0, 1.5) if carried else there, abs=1e-12)
     state, believed = flown(state, 2, p_WB=(there[0] + 0.002, *there[1:]))
     assert state.jump == pytest.approx(0.0, abs=1e-12)

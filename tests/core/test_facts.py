@@ -247,7 +247,27 @@ def test_without_attitude_no_motion_is_waited_for() -> None:
 @pytest.mark.parametrize("phase", Phase)
 def test_contact_is_lost_only_in_press(phase: Phase) -> None:
     assert known(phase=phase).contact_lost is (phase is Phase.PRESS)
-    assert not known(phase=phase, believed=replace(HIGH, in_contact=True)).contact_lost
+    crack = derive(CONFIG).site.crack
+    assert not known(phase=phase, believed=replace(HIGH, in_contact=True, tip_W=crack)).contact_lost
+
+
+def test_contact_is_not_lost_while_it_is_looked_for_at_the_crack() -> None:
+    x, y, z = derive(CONFIG).site.crack
+    seeking = Progress(lost=False)
+    limits = CONFIG.contact
+    for tip, touching, lost in (
+        ((x - 0.01, y, z), False, False),
+        ((x, y + 2.0 * limits.tolerance + 0.01, z), False, True),
+        ((x, y + 2.0 * limits.tolerance + 0.01, z), True, False),
+        ((x, y, z - limits.height - 0.01), True, True),
+    ):
+        believed = replace(HIGH, in_contact=touching, tip_W=tip)
+        assert known(phase=Phase.PRESS, believed=believed, progress=seeking).contact_lost is lost
+
+
+def test_a_pipe_that_was_not_felt_is_overtravel() -> None:
+    assert known(phase=Phase.ALIGN, progress=Progress(missed=True)).overtravel
+    assert not known(phase=Phase.ALIGN).overtravel
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.5 * pi, -2.5])
