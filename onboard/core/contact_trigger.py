@@ -2,7 +2,7 @@
 
 Contact is lost when next to no force is left for ``lost_time``; or, while a larger force is asked for, when the
 estimate falls far short of it: then the push goes into nothing and moves the vehicle towards the pipe, so that is
-told at once.
+told at once. A noisy reading now and then hides no loss: the time counts back as fast as it has counted up.
 
 A gust at the crack is force at the crack. Two more witnesses tell it from contact, each asked for by a parameter: what
 the joints feel at the tip, where no wind acts (``felt``), and the onset: a contact rises in tenths of a second above
@@ -68,6 +68,6 @@ def step(state: State, distance: float, force: float, felt: float, desired: floa
         if not against:
             before += (force - before) * dt / (params.onset_time + dt)
     if not against:
-        return State(state.contact, 0.0, before)
+        return State(state.contact, max(0.0, state.time - dt) if state.contact else 0.0, before)
     time = state.time + dt
     return State(not state.contact, 0.0, before) if time >= limit else State(state.contact, time, before)

@@ -43,9 +43,20 @@ def desired_force(t: float, start: float, force: float, hold: float, params: Par
     """
     p = params
     if t < p.settle:
-        return start + (p.bias - start) * quintic(t / p.settle), False
+        return settled(t, start, p)[0], False
     t -= p.settle + p.bias_hold
     if t < p.ramp:
         return p.bias + (force - p.bias) * quintic(t / p.ramp), False
     t -= p.ramp + hold
     return force + (p.bias - force) * quintic(t / p.ramp), t >= p.ramp + p.bias_hold
+
+
+def held_at(hold: float, params: Params) -> float:
+    """Time from the trigger at which the set force has been held for ``hold``, s."""
+    return params.settle + params.bias_hold + params.ramp + hold
+
+
+def settled(t: float, start: float, params: Params) -> tuple[float, bool]:
+    """The same where the set force has been held before: to the bias alone."""
+    p = params
+    return start + (p.bias - start) * quintic(t / p.settle), t >= p.settle + p.bias_hold

@@ -42,6 +42,8 @@ LAST_DESCENT = 0.35
 BEYOND = 0.02
 #: Contact that is lost is looked for from no farther ahead of the vehicle, m.
 NOT_FAR = 0.03
+#: The contact is felt, or is not, over this time, s.
+FELT_OVER = 0.1
 #: An estimate this long (s) after the retreat has begun tells whether there is contact.
 SHORTEST_EASE = 0.05
 #: Touched down: the reference is this far below the vehicle (m), which sinks no faster than this (m/s).
@@ -120,6 +122,12 @@ class State(Struct, frozen=True, gc=False):
     """It was found by touch."""
     seeking: float = -1.0
     """Pressing: time since contact was lost and is being looked for, s; negative when it is not."""
+    held: bool = False
+    """Pressing: the set force has been held for its time."""
+    spare: float = -1.0
+    """So much more than contact must have is felt, in the mean over ``FELT_OVER``, N; negative: no contact is felt."""
+    dropped: bool = False
+    """The sleeve was let go where no contact was felt."""
 
 
 class Progress(Struct, frozen=True, gc=False):
@@ -127,7 +135,10 @@ class Progress(Struct, frozen=True, gc=False):
 
     arrived: bool = False
     pressed: bool = False
+    """The force profile has ended, and contact is felt."""
     released: bool = False
+    dropped: bool = False
+    """The sleeve was let go where no contact was felt."""
     tare_begun: bool = False
     """The readings from now on are to become one tare: those that are made while ``taring``."""
     taring: bool = False
@@ -206,15 +217,15 @@ def step(
     if phase is Phase.LAND and _touched_down(state, estimate):
         lift = max(0.0, lift - dt / params.plan.spool)
 
-    seeking = state.seeking
-    if phase is Phase.PRESS and own.seek_time > 0.0:
+    seeking, spare = state.seeking, _spare(state.spare, estimate, params, dt)
+    if (phase is Phase.PRESS or (phase is Phase.RELEASE and estimate.payload)) and own.seek_time > 0.0:
         if seeking >= 0.0:
             seeking += dt
             if estimate.in_contact:
                 state, seeking = _press(state, estimate, derived, params), -1.0
         elif not estimate.in_contact:
             state, seeking = _seek(state, estimate, site, params), 0.0
-    elif phase is not Phase.PRESS:
+    else:
         seeking = -1.0
     leg = state.legs[state.index] if state.index < len(state.legs) else None
     if leg is not None and leg.feeling and estimate.in_contact:
@@ -230,7 +241,7 @@ def step(
         press_time += dt
         force, pressed = _profile(press_time, state, params)
         ahead, _ = _profile(press_time + lead, state, params)
-    elif phase is Phase.RELEASE:
+    elif phase is Phase.RELEASE and seeking < 0.0:
         force = ahead = params.force_profile.bias
     elif easing >= 0.0:
         easing += dt
@@ -260,9 +271,11 @@ def step(
         clock += dt
         near = _near(state, estimate, own)
         settled = settled + dt if near else 0.0
-    released_for = state.released_for
+    released_for, dropped = state.released_for, state.dropped
     if phase is Phase.RELEASE and not estimate.payload:
         released_for += dt
+        if released_for <= FELT_OVER:
+            dropped = spare < 0.0
 
     compliant, acceleration = state.admittance, 0.0
     if pressing:
@@ -272,7 +285,7 @@ def step(
         phase, state.legs, state.index, state.time, state.start, state.start_rate, state.start_acceleration,
         state.moving,
         state.at, state.rate, state.acceleration, state.home, settled, clock, lift, press_time, state.press_start,
-        force, easing, compliant, released_for, tare, state.along, state.felt, seeking,
+        force, easing, compliant, released_for, tare, state.along, state.felt, seeking, state.held, spare, dropped,
     )  # fmt: skip
     arrived = ended and easing < 0.0 and settled >= own.settle_time and lift >= 1.0
     tare_begun = tare or phase is Phase.TARE
@@ -284,8 +297,9 @@ def step(
         tared = state.time + dt >= leg.duration
     progress = Progress(
         arrived,
-        pressed,
+        pressed and spare >= 0.0,
         released_for >= own.release_hold,
+        dropped,
         tare_begun,
         taring,
         tared,
@@ -298,8 +312,19 @@ def step(
     return state, _reference(state, params, acceleration, ahead, pressing), progress
 
 
+def _spare(before: float, estimate: Estimate, params: AllParams, dt: float) -> float:
+    """How much more than the contact trigger wants is felt, in the mean, N."""
+    own = params.contact
+    spare = estimate.contact_force - own.threshold
+    if own.felt > 0.0:
+        spare = min(spare, estimate.forces.felt - own.felt)
+    return before + (spare - before) * dt / (FELT_OVER + dt)
+
+
 def _profile(t: float, state: State, params: AllParams) -> tuple[float, bool]:
     repair = params.repair
+    if state.held:
+        return force_profile.settled(t, state.press_start, params.force_profile)
     return force_profile.desired_force(t, state.press_start, repair.force, repair.hold, params.force_profile)
 
 
@@ -318,7 +343,8 @@ def _reference(state: State, params: AllParams, compliant: float, force_ahead: f
         vx, vy = vx + offset.velocity * nx, vy + offset.velocity * ny
         ax, ay = ax + compliant * nx, ay + compliant * ny
     own = params.guidance
-    open_gripper = state.phase is Phase.RELEASE or (state.released_for > 0.0)
+    # only a pipe that is felt is given the sleeve
+    open_gripper = (state.phase is Phase.RELEASE and state.spare >= 0.0) or state.released_for > 0.0
     leg = state.legs[state.index] if state.index < len(state.legs) else None
     return Reference(
         (x, y, z), (vx, vy, vz), (ax, ay, az), yaw, yaw_rate, yaw_acceleration, (wx, wz), (vwx, vwz), elevation,
@@ -341,7 +367,7 @@ def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived:
     force = state.force
     easing = -1.0
     if phase is Phase.PRESS:
-        state = _press(state, estimate, derived, params)
+        state = replace(_press(state, estimate, derived, params), held=False)
         force = state.press_start
     elif phase is not Phase.RELEASE:
         if phase in BACKING_OUT and state.easing >= 0.0:
@@ -371,7 +397,10 @@ def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived:
 
 
 def _press(state: State, estimate: Estimate, derived: Derived, params: AllParams) -> State:
-    """The state with the force loop closed where contact was felt."""
+    """The state with the force loop closed where contact was felt.
+
+    The profile begins anew, but a force that has been held once is not held again.
+    """
     # the translation law pushes as it did at the trigger: with what it feeds forward, and an offset for the rest
     push = min(max(0.0, estimate.contact_force), params.repair.force)
     lead = (1.0 - params.backstepping.feed_forward) * push / derived.normal_stiffness
@@ -379,7 +408,10 @@ def _press(state: State, estimate: Estimate, derived: Derived, params: AllParams
     at = _base_measured(state.at, estimate)
     state = _start_from(state, (at[0] + lead * n[0], at[1] + lead * n[1], *at[2:]))
     along = _along(estimate, derived) if params.plan.feel else state.along
-    return replace(state, legs=(), press_time=0.0, press_start=push, admittance=admittance.State(), along=along)
+    held = state.held or state.press_time >= force_profile.held_at(params.repair.hold, params.force_profile)
+    return replace(
+        state, legs=(), press_time=0.0, press_start=push, admittance=admittance.State(), along=along, held=held
+    )
 
 
 def _seek(state: State, estimate: Estimate, site: Site, params: AllParams) -> State:

@@ -6,10 +6,10 @@ import pytest
 from msgspec.structs import replace
 
 from onboard.config import Config, load_config
-from onboard.core import plan
+from onboard.core import force_profile, plan
 from onboard.core.derived import derive
 from onboard.core.types import Phase
-from tests.core.following import DT, Follower
+from tests.core.following import DT, Follower, Step
 
 CONFIG: Config = load_config(
     "paper", sets=["plan.feel=true", "guidance.seek_time=2.0", "pipe.position=[2.0,0.7,1.8]", "pipe.heading_deg=35.0"]
@@ -114,6 +114,72 @@ def test_contact_that_is_not_found_again_is_lost() -> None:
     follower.estimate = replace(follower.estimate, in_contact=False)
     follower.run(Phase.PRESS, G.seek_time + 0.1)
     assert follower.steps[-1].progress.lost
+
+
+def at_the_end() -> Follower:
+    """Pressing at the bias, the force held before, a moment before the profile ends."""
+    follower = pressing()
+    r, f = CONFIG.repair, CONFIG.force_profile
+    end = force_profile.held_at(r.hold, f) + f.ramp + f.bias_hold
+    follower.run(Phase.PRESS, end - follower.state.press_time - 0.1)
+    assert not follower.steps[-1].progress.pressed
+    return follower
+
+
+class Off(Follower):
+    """Pressing into nothing, which the contact trigger has not told yet."""
+
+    def tick(self, phase: Phase, engaged: bool = True, tare: bool = False) -> Step:
+        """One tick in ``phase``."""
+        self.estimate = replace(self.estimate, contact_force=0.0)
+        return super().tick(phase, engaged, tare)
+
+
+def off(follower: Follower) -> Follower:
+    """From here on nothing is felt."""
+    off = Off.__new__(Off)
+    off.__dict__ = follower.copy().__dict__
+    return off
+
+
+def test_only_a_pipe_that_is_felt_is_given_the_sleeve() -> None:
+    felt, unfelt = at_the_end(), off(at_the_end()).run(Phase.PRESS, 3.0)
+    assert not any(step.progress.pressed for step in unfelt.steps)
+    assert felt.run(Phase.PRESS, 0.2).steps[-1].progress.pressed
+    assert felt.tick(Phase.RELEASE).reference.gripper == G.gripper_open
+    lost = off(felt).run(Phase.RELEASE, 0.2)
+    assert lost.steps[-1].reference.gripper == G.gripper_closed
+    lost.estimate = replace(lost.estimate, payload=False)
+    assert lost.run(Phase.RELEASE, G.release_hold + 0.1).steps[-1].reference.gripper == G.gripper_open
+    assert lost.steps[-1].progress.released
+    assert lost.steps[-1].progress.dropped
+    felt.finish(Phase.RELEASE)
+    assert not felt.steps[-1].progress.dropped
+    assert not off(felt).run(Phase.RETREAT, 1.0).steps[-1].progress.dropped, "what comes after it says nothing of it"
+
+
+def test_a_force_that_was_held_is_not_held_again() -> None:
+    follower = at_the_end()
+    follower.estimate = replace(follower.estimate, in_contact=False)
+    follower.run(Phase.PRESS, 0.5)
+    assert follower.steps[-1].reference.force == 0.0
+    before = len(follower.steps)
+    again = touching(follower, 0.02).finish(Phase.PRESS).steps[before:]
+    f = CONFIG.force_profile
+    assert len(again) * DT == pytest.approx(f.settle + f.bias_hold, abs=0.05)
+    assert all(step.reference.pressing and step.reference.force <= f.bias + 1e-9 for step in again)
+
+
+def test_contact_lost_in_the_release_is_looked_for() -> None:
+    follower = at_the_end().run(Phase.PRESS, 0.2)
+    follower.estimate = replace(follower.estimate, in_contact=False)
+    before = follower.from_crack
+    follower.run(Phase.RELEASE, 1.0)
+    assert not follower.steps[-1].reference.pressing
+    assert 0.0 < before - follower.from_crack < G.seek_speed
+    reference = touching(follower, 0.02).tick(Phase.RELEASE).reference
+    assert reference.pressing
+    assert reference.force == CONFIG.force_profile.bias
 
 
 def test_found_moves_the_crack_along_the_normal_alone() -> None:

@@ -167,7 +167,8 @@ def test_trigger_lets_go_only_after_its_time() -> None:
     n = round(T.lost_time / DT) + 1
     assert run([(0.0, 0.0)] * (n - 2), held).contact
     assert not run([(0.0, 0.0)] * n, held).contact
-    assert run(([(0.0, 0.0)] * (n - 2) + [(0.0, 0.2)]) * 5, held).contact
+    assert run([(0.0, 0.0), (0.0, 0.2)] * 5 * n, held).contact, "as often with force as without"
+    assert not run(([(0.0, 0.0)] * 9 + [(0.0, 0.2)]) * n, held).contact, "a noisy reading now and then hides no loss"
 
 
 def test_a_push_into_nothing_is_told_at_once() -> None:

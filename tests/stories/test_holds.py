@@ -23,6 +23,8 @@ from tests.stories.flight import PERIOD, Flight, moved
 SETS = ("repair.hold=2.0", "plan.arc_max=0.2", "force_profile.ramp=3.0")
 SEED = 0
 NEARER = 0.05
+#: Of the press: so long after the trigger the sleeve is about to be let go, s.
+END = 10.8
 #: A loss of contact is over by then, s.
 RECOVERED = 2.0
 
@@ -140,6 +142,27 @@ def test_contact_is_lost_and_found_again(pressing: Flight) -> None:
     assert contact.longest > 0.02
     pressing.is_in(Phase.PRESS)
     released(contact, peak=12.0)
+
+
+def test_the_tip_is_off_the_pipe_when_the_sleeve_is_to_be_let_go(pressing: Flight) -> None:
+    """It is let go once the pipe is felt again."""
+    pressing.until(lambda o: pressing.state.guidance.press_time > END, 30.0)
+    pressing.world.plant.x[at_.VELOCITY] = -0.06
+    contact = Contact(pressing)
+    released(contact, peak=12.0)
+    assert contact.longest > 0.1
+    assert pressing.phases.count(Phase.PRESS) == 1
+
+
+def test_the_vehicle_does_not_tell_completed_of_a_sleeve_it_dropped(pressing: Flight) -> None:
+    """Flung off while the gripper opens: too late to close it."""
+    pressing.reach(Phase.RELEASE, within=60.0)
+    pressing.until(lambda _: pressing.truth.gripper > 0.6, 5.0)
+    pressing.world.plant.x[at_.VELOCITY] = -0.30
+    pressing.reach(Phase.RETREAT, Phase.RETURN, within=40.0)
+    assert not pressing.truth.sleeve_on_pipe
+    assert "return_dropped" in pressing.said
+    assert not pressing.state.mission.homeward
 
 
 def test_the_tip_slips_off(pressing: Flight) -> None:
