@@ -218,7 +218,8 @@ def step(
         lift = max(0.0, lift - dt / params.plan.spool)
 
     seeking, spare = state.seeking, _spare(state.spare, estimate, params, dt)
-    if (phase is Phase.PRESS or (phase is Phase.RELEASE and estimate.payload)) and own.seek_time > 0.0:
+    sought = phase is Phase.PRESS or (phase is Phase.RELEASE and (estimate.payload or seeking >= 0.0))
+    if sought and own.seek_time > 0.0:
         if seeking >= 0.0:
             seeking += dt
             if estimate.in_contact:

@@ -614,7 +614,8 @@ def stimuli() -> list[tuple[Request | None, Action, Facts]]:
     some = [
         *(replace(FLYING, arrived=True, go=go) for go in GO), replace(FLYING, go=Phase.ALIGN, payload=False),
         FLYING, NOTHING, DOWN, replace(NOTHING, ready=True), replace(FLYING, offboard_lost=True),
-        replace(FLYING, arrived=True, tared=True), replace(FLYING, arrived=True, released=True, dropped=True), *(replace(FLYING, **{name: True}) for name in ends),
+        replace(FLYING, arrived=True, tared=True), replace(FLYING, arrived=True, released=True, dropped=True),
+        *(replace(FLYING, **{name: True}) for name in ends),
     ]  # fmt: skip
     found: list[tuple[Request | None, Action, Facts]] = [(request, Action.NONE, f) for request in Request for f in some]
     return found + [(None, action, f) for action in Action for f in some]
@@ -704,7 +705,8 @@ def test_every_row_of_the_table_can_fire() -> None:
 def endings(phase: Phase) -> Iterator[tuple[State, Facts]]:
     """What facts alone may depend on: one at a time, with the flags of the state."""
     ends: list[dict[str, Any]] = [
-        {"arrived": True}, {"arrived": True, "tared": True}, {"arrived": True, "dropped": True}, {"landed": True, "disarmed": True}, {}
+        {"arrived": True}, {"arrived": True, "tared": True}, {"arrived": True, "dropped": True},
+        {"landed": True, "disarmed": True}, {},
     ]  # fmt: skip
     ends += [{"arrived": True, "payload": go is not Phase.TARE, "go": go} for go in Phase]
     ends += [{"tare_used": False}, {"engaged": False}, {"released": True, "go": Phase.RETURN}]
