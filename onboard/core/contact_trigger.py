@@ -18,6 +18,10 @@ from msgspec import Struct
 from onboard.core.spec import spec
 
 
+#: So many times the tolerance from the crack, contact is lost.
+FAR = 2.0
+
+
 class Params(Struct, frozen=True, forbid_unknown_fields=True):
     """When contact is believed, and when it is believed lost."""
 
@@ -46,21 +50,23 @@ class State(Struct, frozen=True, gc=False):
     """Slow mean of the estimate before the contact, N; None before the first tick."""
 
 
-def step(state: State, distance: float, force: float, felt: float, desired: float, params: Params, dt: float) -> State:
+def step(
+    state: State, distance: float, force: float, felt: float, desired: float, params: Params, dt: float, again: bool
+) -> State:
     """One tick.
 
     distance: of the tip from the crack, m. force, felt, desired: compression as estimated, as felt by the joints, as
-    wanted, N.
+    wanted, N. again: contact was there and is looked for: it is found wherever it would not be lost.
     """
     before = force if state.before is None else state.before
     if state.contact:
         short = desired >= params.short_force and force < params.short_share * desired
-        against = short or force < params.lost_force or distance > 2.0 * params.tolerance
+        against = short or force < params.lost_force or distance > FAR * params.tolerance
         limit = params.short_time if short else params.lost_time
     else:
         against = (
             force > params.threshold
-            and distance < params.tolerance
+            and distance < (FAR if again else 1.0) * params.tolerance
             and (params.felt == 0.0 or felt > params.felt)
             and (params.onset == 0.0 or force - before > params.onset)
         )

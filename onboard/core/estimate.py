@@ -24,7 +24,8 @@ from onboard.core.types import Estimate, Inputs, Phase, Reference
 if TYPE_CHECKING:
     from onboard.core.params import Params as AllParams
 
-NEAR_PIPE = (Phase.ADVANCE, Phase.PRESS, Phase.RELEASE)
+PRESSING = (Phase.PRESS, Phase.RELEASE)
+NEAR_PIPE = (Phase.ADVANCE, *PRESSING)
 #: On the way out of contact.
 LEAVING = (Phase.ALIGN, Phase.TARE, Phase.RETREAT, Phase.RETREAT_HOLD, Phase.RETREAT_LAND)
 ON_GROUND = (Phase.PREFLIGHT, Phase.ARMED, Phase.STOPPED)
@@ -174,12 +175,13 @@ def step(
     trigger, alarm = state.trigger, state.alarm
     if at_pipe:
         asked = reference.force if reference is not None and reference.pressing else 0.0
-        trigger = contact_trigger.step(trigger, distance, compression, forces.felt, asked, params.contact, dt)
+        again = phase in PRESSING  # from there on contact that is not there was lost
+        trigger = contact_trigger.step(trigger, distance, compression, forces.felt, asked, params.contact, dt, again)
         alarm = _QUIET
     else:
         trigger = _QUIET
         if phase in FREE_FLIGHT:
-            alarm = contact_trigger.step(alarm, 0.0, compression, forces.felt, 0.0, params.contact, dt)
+            alarm = contact_trigger.step(alarm, 0.0, compression, forces.felt, 0.0, params.contact, dt, False)
         else:
             alarm = _QUIET
     if alarm.contact:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from drivers.samples import Engage, FlightMode, JointMode, Landed
-from onboard.core import estimators, limits, math3, mission, safety
+from onboard.core import contact_trigger, estimators, limits, math3, mission, safety
 from onboard.core.guidance import Progress
 from onboard.core.types import Estimate, Estimator, Inputs, Phase, Reference, Verdict
 
@@ -135,7 +135,8 @@ def for_mission(
         contact_lost=phase is Phase.PRESS
         # where the tip is off the crack, pushing on would not find it, but lead past the pipe
         and (
-            abs(up) > contact.height or (not believed.in_contact and (progress.lost or aside > 2.0 * contact.tolerance))
+            abs(up) > contact.height
+            or (not believed.in_contact and (progress.lost or aside > contact_trigger.FAR * contact.tolerance))
         ),
         overtravel=progress.missed or (phase is Phase.ADVANCE and beyond > params.plan.overtravel),
         blind=safety.blind(verdict),

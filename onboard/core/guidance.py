@@ -223,7 +223,8 @@ def step(
         if seeking >= 0.0:
             seeking += dt
             if estimate.in_contact:
-                state, seeking = _press(state, estimate, derived, params), -1.0
+                found = _ahead_measured(state.at, estimate, site)
+                state, seeking = _press(state, found, estimate, derived, params), -1.0
         elif not estimate.in_contact:
             state, seeking = _seek(state, estimate, site, params), 0.0
     else:
@@ -368,7 +369,8 @@ def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived:
     force = state.force
     easing = -1.0
     if phase is Phase.PRESS:
-        state = replace(_press(state, estimate, derived, params), held=False)
+        state = _press(state, _base_measured(state.at, estimate), estimate, derived, params)
+        state = replace(state, held=False)
         force = state.press_start
     elif phase is not Phase.RELEASE:
         if phase in BACKING_OUT and state.easing >= 0.0:
@@ -397,8 +399,8 @@ def _enter(state: State, phase: Phase, estimate: Estimate, pump: float, derived:
     return replace(state, legs=legs)
 
 
-def _press(state: State, estimate: Estimate, derived: Derived, params: AllParams) -> State:
-    """The state with the force loop closed where contact was felt.
+def _press(state: State, at: Eight, estimate: Estimate, derived: Derived, params: AllParams) -> State:
+    """The state with the force loop closed at ``at``, where contact was felt.
 
     The profile begins anew, but a force that has been held once is not held again.
     """
@@ -406,7 +408,6 @@ def _press(state: State, estimate: Estimate, derived: Derived, params: AllParams
     push = min(max(0.0, estimate.contact_force), params.repair.force)
     lead = (1.0 - params.backstepping.feed_forward) * push / derived.normal_stiffness
     n = derived.site.normal
-    at = _base_measured(state.at, estimate)
     state = _start_from(state, (at[0] + lead * n[0], at[1] + lead * n[1], *at[2:]))
     along = _along(estimate, derived) if params.plan.feel else state.along
     held = state.held or state.press_time >= force_profile.held_at(params.repair.hold, params.force_profile)
@@ -417,7 +418,7 @@ def _press(state: State, estimate: Estimate, derived: Derived, params: AllParams
 
 def _seek(state: State, estimate: Estimate, site: Site, params: AllParams) -> State:
     """The state with the tip on its way back to the pipe, which is where it was felt last."""
-    tip, (nx, ny), at = estimate.tip_W, site.normal, _base_measured(state.at, estimate)
+    tip, (nx, ny), at = estimate.tip_W, site.normal, _ahead_measured(state.at, estimate, site)
     gap = min(NOT_FAR, max(0.0, (site.crack[0] - tip[0]) * nx + (site.crack[1] - tip[1]) * ny))
     state = _start_from(state, (at[0] + gap * nx, at[1] + gap * ny, *at[2:]))
     speed = params.guidance.seek_speed
@@ -451,6 +452,13 @@ def _start_from(state: State, at: Eight) -> State:
 def _base_measured(at: Eight, estimate: Estimate) -> Eight:
     """``at`` with the horizontal position of the base as measured: where contact has put it."""
     return (estimate.p_WB[0], estimate.p_WB[1], *at[2:])
+
+
+def _ahead_measured(at: Eight, estimate: Estimate, site: Site) -> Eight:
+    """``at`` with the base as far towards the pipe as measured; along the pipe it is not given up what was held."""
+    (nx, ny), p = site.normal, estimate.p_WB
+    ahead = (p[0] - at[0]) * nx + (p[1] - at[1]) * ny
+    return (at[0] + ahead * nx, at[1] + ahead * ny, *at[2:])
 
 
 def _plan(phase: Phase, state: State, site: Site, params: AllParams) -> tuple[Leg, ...]:

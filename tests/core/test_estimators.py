@@ -381,7 +381,7 @@ def test_a_gust_with_the_tip_at_the_crack(selected: Estimator, false: bool) -> N
         forces = craft.tick(wind=(-0.8 * min(1.0, k * DT), 0.0, 0.0))
         force = estimators.selected(forces, replace(CONFIG.estimators, selected=selected)).contact
         for i, own in enumerate((params, asking)):
-            states[i] = contact_trigger.step(states[i], 0.0, force, forces.felt, 0.0, own, DT)
+            states[i] = contact_trigger.step(states[i], 0.0, force, forces.felt, 0.0, own, DT, False)
             pulled[i] |= states[i].contact
     assert pulled == [false, False]
 

@@ -147,9 +147,10 @@ def run(
     desired: float = 0.0,
     felt: float = 0.0,
     params: contact_trigger.Params = T,
+    again: bool = False,
 ) -> contact_trigger.State:
     for distance, force in pairs:
-        state = contact_trigger.step(state, distance, force, felt, desired, params, DT)
+        state = contact_trigger.step(state, distance, force, felt, desired, params, DT, again)
     return state
 
 
@@ -160,6 +161,14 @@ def test_trigger_wants_place_and_force_for_the_debounce() -> None:
     assert not run([(T.tolerance * 1.1, 1.0)] * n).contact, "force far from the crack is wind"
     assert not run([(0.0, T.threshold * 0.9)] * n).contact, "at the crack without force is no contact"
     assert not run(([(0.0, 1.0)] * (n - 2) + [(0.0, 0.0)]) * 5).contact, "an interruption starts the debounce again"
+
+
+def test_contact_that_was_lost_is_found_wherever_it_would_not_be_lost() -> None:
+    n = round(T.debounce / DT) + 1
+    for far, found in ((1.9, True), (2.1, False)):
+        pairs = [(T.tolerance * far, 1.0)] * n
+        assert run(pairs, again=True).contact is found
+        assert not run(pairs).contact
 
 
 def test_trigger_lets_go_only_after_its_time() -> None:
