@@ -44,6 +44,8 @@ BEYOND = 0.02
 NOT_FAR = 0.03
 #: The contact is felt, or is not, over this time, s.
 FELT_OVER = 0.1
+#: What is felt so long after the sleeve was seen gone tells how it was as it went: estimate and mean are late, s.
+FELT_LATE = 0.15
 #: An estimate this long (s) after the retreat has begun tells whether there is contact.
 SHORTEST_EASE = 0.05
 #: Touched down: the reference is this far below the vehicle (m), which sinks no faster than this (m/s).
@@ -276,7 +278,7 @@ def step(
     released_for, dropped = state.released_for, state.dropped
     if phase is Phase.RELEASE and not estimate.payload:
         released_for += dt
-        if released_for <= FELT_OVER:
+        if released_for <= FELT_LATE:
             dropped = spare < 0.0
 
     compliant, acceleration = state.admittance, 0.0
