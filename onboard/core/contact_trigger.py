@@ -17,7 +17,6 @@ from msgspec import Struct
 
 from onboard.core.spec import spec
 
-
 #: So many times the tolerance from the crack, contact is lost.
 FAR = 2.0
 

@@ -145,7 +145,6 @@ def for_mission(
         tare=estimators.tare_in_force(seen.forces, params.estimators),
         tare_used=params.observer.tare or params.estimators.selected is not Estimator.PAPER,
         go=go,
-        dropped=progress.dropped,
     )
 
 

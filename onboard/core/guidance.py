@@ -44,8 +44,6 @@ BEYOND = 0.02
 NOT_FAR = 0.03
 #: The contact is felt, or is not, over this time, s.
 FELT_OVER = 0.1
-#: What is felt so long after the sleeve was seen gone tells how it was as it went: estimate and mean are late, s.
-FELT_LATE = 0.15
 #: An estimate this long (s) after the retreat has begun tells whether there is contact.
 SHORTEST_EASE = 0.05
 #: Touched down: the reference is this far below the vehicle (m), which sinks no faster than this (m/s).
@@ -128,8 +126,6 @@ class State(Struct, frozen=True, gc=False):
     """Pressing: the set force has been held for its time."""
     spare: float = -1.0
     """So much more than contact must have is felt, in the mean over ``FELT_OVER``, N; negative: no contact is felt."""
-    dropped: bool = False
-    """The sleeve was let go where no contact was felt."""
 
 
 class Progress(Struct, frozen=True, gc=False):
@@ -139,8 +135,6 @@ class Progress(Struct, frozen=True, gc=False):
     pressed: bool = False
     """The force profile has ended, and contact is felt."""
     released: bool = False
-    dropped: bool = False
-    """The sleeve was let go where no contact was felt."""
     tare_begun: bool = False
     """The readings from now on are to become one tare: those that are made while ``taring``."""
     taring: bool = False
@@ -275,11 +269,9 @@ def step(
         clock += dt
         near = _near(state, estimate, own)
         settled = settled + dt if near else 0.0
-    released_for, dropped = state.released_for, state.dropped
+    released_for = state.released_for
     if phase is Phase.RELEASE and not estimate.payload:
         released_for += dt
-        if released_for <= FELT_LATE:
-            dropped = spare < 0.0
 
     compliant, acceleration = state.admittance, 0.0
     if pressing:
@@ -289,7 +281,7 @@ def step(
         phase, state.legs, state.index, state.time, state.start, state.start_rate, state.start_acceleration,
         state.moving,
         state.at, state.rate, state.acceleration, state.home, settled, clock, lift, press_time, state.press_start,
-        force, easing, compliant, released_for, tare, state.along, state.felt, seeking, state.held, spare, dropped,
+        force, easing, compliant, released_for, tare, state.along, state.felt, seeking, state.held, spare,
     )  # fmt: skip
     arrived = ended and easing < 0.0 and settled >= own.settle_time and lift >= 1.0
     tare_begun = tare or phase is Phase.TARE
@@ -303,7 +295,6 @@ def step(
         arrived,
         pressed and spare >= 0.0,
         released_for >= own.release_hold,
-        dropped,
         tare_begun,
         taring,
         tared,

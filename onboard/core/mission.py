@@ -17,8 +17,6 @@ wins.
 - Lost contact in PRESS goes back to TARE (the reference backs off, the observer is tared anew) and presses again;
   after ``max_attempts`` of these, or when ADVANCE (or ALIGN, feeling for the pipe) finds no contact in reach, the
   mission gives up: it retreats, returns and lands, and does not count as completed.
-- Nobody sees the sleeve on the pipe: that contact was felt when it was let go is all there is to know. If it was not
-  (``Facts.dropped``), the mission does not count as completed.
 - The autopilot lands by itself (``State.autoland``) when the position is lost or LAND takes too long. Once it has
   left offboard by itself, or a pilot has taken it (``State.yielded``), nothing is asked of it any more but KILL.
 """
@@ -101,8 +99,6 @@ class Facts(Struct, frozen=True, gc=False):
     tare_used: bool = True
     go: Phase | None = None
     """Where to, with a request to go."""
-    dropped: bool = False
-    """The sleeve was let go where no contact was felt."""
 
 
 class State(Struct, frozen=True, gc=False):
@@ -115,7 +111,7 @@ class State(Struct, frozen=True, gc=False):
     """The phase that was interrupted."""
     mode: Literal["takeoff", "mission"] = "mission"
     completed: bool = False
-    """The sleeve was released where contact was felt, the vehicle came back and landed."""
+    """The sleeve was released onto the pipe, the vehicle came back and landed."""
     attempts: int = 0
     """Presses begun again after lost contact."""
     giving_up: bool = False
@@ -254,11 +250,6 @@ def released(state: State, facts: Facts, params: Params) -> bool:
     return facts.released
 
 
-def arrived_dropped(state: State, facts: Facts, params: Params) -> bool:
-    """Motion ended and settled, the sleeve let go where no contact was felt."""
-    return facts.arrived and facts.dropped
-
-
 def gave_up(state: State, facts: Facts, params: Params) -> bool:
     """Motion ended and settled, the mission given up."""
     return facts.arrived and state.giving_up
@@ -292,11 +283,6 @@ def hover_only(state: State, facts: Facts, params: Params) -> bool:
 def nothing_interrupted(state: State, facts: Facts, params: Params) -> bool:
     """No phase was interrupted."""
     return state.resume_phase is None
-
-
-def out_of_release_dropped(state: State, facts: Facts, params: Params) -> bool:
-    """RELEASE was interrupted, the payload is gone, let go where no contact was felt."""
-    return out_of_release(state, facts, params) and facts.dropped
 
 
 def out_of_release(state: State, facts: Facts, params: Params) -> bool:
@@ -395,8 +381,8 @@ def go_from_pipe(state: State, facts: Facts, params: Params) -> bool:
 
 
 def go_home_done(state: State, facts: Facts, params: Params) -> bool:
-    """To RETURN, the sleeve released where contact was felt."""
-    return facts.go is P.RETURN and facts.released and not facts.dropped
+    """To RETURN, the sleeve released."""
+    return facts.go is P.RETURN and facts.released
 
 
 def go_home_undone(state: State, facts: Facts, params: Params) -> bool:
@@ -467,7 +453,6 @@ TABLE: Final[tuple[Row, ...]] = (
     Row((P.ARMED, *FLYING), _RESET, always, None, "refused_reset"),
 
     Row((P.HOLD,), _RESUME, nothing_interrupted, None, "refused_nothing"),
-    Row((P.HOLD,), _RESUME, out_of_release_dropped, P.RETURN, "return_dropped", {**_FRESH, **_BROKEN_OFF}),
     Row((P.HOLD,), _RESUME, out_of_release, P.RETURN, "return", {**_FRESH, "homeward": True}),
     Row((P.HOLD,), _RESUME, still_holding, P.TARE, "resume", _FRESH),
     Row((P.HOLD,), _RESUME, always, INTERRUPTED, "resume", _FRESH),
@@ -556,7 +541,6 @@ TABLE: Final[tuple[Row, ...]] = (
     Row((P.PRESS,), _FACTS, late, P.RETREAT_HOLD, "timeout_contact"),
     Row((P.RELEASE,), _FACTS, released, P.RETREAT, "retreat"),
     Row((P.RELEASE,), _FACTS, late, P.RETREAT_HOLD, "timeout_release"),
-    Row((P.RETREAT,), _FACTS, arrived_dropped, P.RETURN, "return_dropped", {**_BROKEN_OFF, **_CLEAR}),
     Row((P.RETREAT,), _FACTS, arrived, P.RETURN, "return", {"homeward": True, **_CLEAR}),
     Row((P.RETREAT,), _FACTS, late, P.RETREAT_HOLD, "timeout_contact"),
     Row((P.RETURN,), _FACTS, arrived, P.LAND, "land", {"resume_phase": None}),
@@ -619,9 +603,6 @@ SENTENCES: Final[Mapping[str, tuple[Severity, str]]] = MappingProxyType({
     "press_again": (_W, "Contact lost: backing off to press again, attempt {attempt} of {max}."),
     "press_given_up": (_E, "Contact lost too often: giving up and returning. Check the pipe and the wind."),
     "no_contact": (_E, "No contact where the pipe should be: giving up and returning. Check the pipe's position."),
-    "return_dropped": (
-        _E, "The sleeve was let go where no pipe was felt: returning. Look where it is before the next try."
-    ),
     "return_undone": (_W, "Clear of the pipe: returning without the repair."),
     "timeout": (_E, "{phase} took too long: hovering in place. Ask to resume, retreat or land."),
     "timeout_preflight": (_W, "No start was asked for in time. Ask to reset when ready."),

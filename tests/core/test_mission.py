@@ -44,13 +44,13 @@ def situations(phase: Phase) -> Iterator[tuple[State, Facts]]:
     """Every combination of what the answer to a demand may depend on."""
     for airborne, contact, ready, clear in product((True, False), repeat=4):
         for resume, mode in product((None, Phase.ALIGN, Phase.RELEASE), ("mission", "takeoff")):
-            for down, (released, dropped) in product((True, False), ((False, False), (True, False), (True, True))):
+            for down, released in product((True, False), repeat=2):
                 state = State(
                     phase, 0.5, resume_phase=resume, mode=mode, clear=clear  # type: ignore[arg-type]
                 )  # fmt: skip
                 facts = replace(
                     FLYING, airborne=airborne, in_contact=contact, ready=ready, landed=down, disarmed=down,
-                    released=released, dropped=dropped,
+                    released=released,
                 )  # fmt: skip
                 yield state, facts
 
@@ -289,21 +289,6 @@ def test_no_contact_gives_up(fact: str) -> None:
     state = run(state, facts=replace(FLYING, overtravel=fact == "overtravel"))
     assert (state.phase, state.giving_up) == (Phase.RETREAT_HOLD, True)
     go_home(state)
-
-
-def test_a_sleeve_let_go_where_nothing_was_felt_completes_nothing() -> None:
-    dropped = replace(FLYING, released=True, dropped=True)
-    retreated, said = step(State(Phase.RETREAT, 1.0), None, Action.NONE, replace(dropped, arrived=True), P, DT)
-    assert said[0][:2] == ("return_dropped", Severity.ERROR)
-    held = State(Phase.HOLD, 1.0, resume_phase=Phase.RELEASE)
-    for way in (
-        retreated,
-        run(held, Request.RESUME, facts=dropped),
-        go(held, Phase.RETURN, replace(dropped, payload=False))[0],
-    ):
-        assert way.phase is Phase.RETURN
-        landed = run(run(way, facts=replace(dropped, arrived=True)), facts=replace(DOWN, dropped=True))
-        assert (landed.phase, landed.completed) == (Phase.STOPPED, False)
 
 
 def go_home(state: State) -> None:
@@ -614,8 +599,7 @@ def stimuli() -> list[tuple[Request | None, Action, Facts]]:
     some = [
         *(replace(FLYING, arrived=True, go=go) for go in GO), replace(FLYING, go=Phase.ALIGN, payload=False),
         FLYING, NOTHING, DOWN, replace(NOTHING, ready=True), replace(FLYING, offboard_lost=True),
-        replace(FLYING, arrived=True, tared=True), replace(FLYING, arrived=True, released=True, dropped=True),
-        *(replace(FLYING, **{name: True}) for name in ends),
+        replace(FLYING, arrived=True, tared=True), *(replace(FLYING, **{name: True}) for name in ends),
     ]  # fmt: skip
     found: list[tuple[Request | None, Action, Facts]] = [(request, Action.NONE, f) for request in Request for f in some]
     return found + [(None, action, f) for action in Action for f in some]
@@ -670,7 +654,6 @@ def test_every_reachable_state() -> None:
                 assert (state.phase, state.homeward) == (Phase.LAND, True)
             if after.homeward and not state.homeward:
                 assert state.phase is Phase.RETREAT or facts.released
-                assert not facts.dropped
             if after.phase is Phase.STOPPED and moved and not after.killed:
                 assert state.phase is Phase.PREFLIGHT or (facts.landed and facts.disarmed)
             assert not (state.killed and moved) or request is Request.RESET
@@ -705,8 +688,7 @@ def test_every_row_of_the_table_can_fire() -> None:
 def endings(phase: Phase) -> Iterator[tuple[State, Facts]]:
     """What facts alone may depend on: one at a time, with the flags of the state."""
     ends: list[dict[str, Any]] = [
-        {"arrived": True}, {"arrived": True, "tared": True}, {"arrived": True, "dropped": True},
-        {"landed": True, "disarmed": True}, {},
+        {"arrived": True}, {"arrived": True, "tared": True}, {"landed": True, "disarmed": True}, {}
     ]  # fmt: skip
     ends += [{"arrived": True, "payload": go is not Phase.TARE, "go": go} for go in Phase]
     ends += [{"tare_used": False}, {"engaged": False}, {"released": True, "go": Phase.RETURN}]

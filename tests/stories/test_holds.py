@@ -154,17 +154,6 @@ def test_the_tip_is_off_the_pipe_when_the_sleeve_is_to_be_let_go(pressing: Fligh
     assert pressing.phases.count(Phase.PRESS) == 1
 
 
-def test_the_vehicle_does_not_tell_completed_of_a_sleeve_it_dropped(pressing: Flight) -> None:
-    """Flung off while the gripper opens: too late to close it."""
-    pressing.reach(Phase.RELEASE, within=60.0)
-    pressing.until(lambda _: pressing.truth.gripper > 0.4, 5.0)
-    pressing.world.plant.x[at_.VELOCITY] = -0.30
-    pressing.reach(Phase.RETREAT, Phase.RETURN, within=40.0)
-    assert not pressing.truth.sleeve_on_pipe
-    assert "return_dropped" in pressing.said
-    assert not pressing.state.mission.homeward
-
-
 def test_the_tip_slips_off(pressing: Flight) -> None:
     """The pipe turns slippery, and the tip slides down round it: it backs off before it is past the pipe."""
     p = pressing.world.plant.p
