@@ -109,6 +109,25 @@ def test_contact_that_is_lost_is_looked_for_softly_and_pressed_anew() -> None:
     assert reference.force == pytest.approx(0.2, abs=0.01)
 
 
+def across(point: tuple[float, ...]) -> float:
+    """How far ``point`` is along the pipe, m."""
+    return point[1] * SITE.normal[0] - point[0] * SITE.normal[1]
+
+
+def test_a_tip_blown_along_the_pipe_is_brought_back() -> None:
+    """Where contact is looked for and where it is found, what held against being blown aside still holds."""
+    follower = pressing()
+    before = across(follower.steps[-1].reference.p)
+    (nx, ny), (x, y, z) = SITE.normal, follower.estimate.p_WB
+    blown = (x - 0.05 * ny, y + 0.05 * nx, z)
+    assert across(blown) - before == pytest.approx(0.05, abs=1e-6)
+    for found in (False, True):
+        follower.estimate = replace(follower.estimate, p_WB=blown, in_contact=found, contact_force=0.2)
+        reference = follower.tick(Phase.PRESS).reference
+        assert reference.pressing is found
+        assert across(reference.p) == pytest.approx(before, abs=1e-4)
+
+
 def test_contact_that_is_not_found_again_is_lost() -> None:
     follower = pressing()
     follower.estimate = replace(follower.estimate, in_contact=False)
