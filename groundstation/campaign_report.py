@@ -13,6 +13,7 @@ import pyarrow as pa
 from groundstation.campaign_figures import COLOURS, LETTERS
 from groundstation.campaign_run import ENDS, FIGURES
 from groundstation.campaign_summary import Rate, Summary, column
+from groundstation.estimators import LABELS
 from groundstation.svg import Chart
 
 _HERE = Path(__file__).parent
@@ -45,6 +46,7 @@ def _page(summary: Summary, table: pa.Table) -> Iterator[str]:
     yield from _ends(summary)
     yield from _matrix(summary)
     yield from _verdicts(summary)
+    yield from _estimators(summary)
     yield from _distributions(summary, table)
     yield from _sensitivities(summary)
     yield from _worst(summary)
@@ -153,11 +155,50 @@ def _verdicts(summary: Summary) -> Iterator[str]:
     yield "</table>"
 
 
+def _estimators(summary: Summary) -> Iterator[str]:
+    if not summary.estimators:
+        return
+    yield '<h2>Force estimators, in the same runs</h2><p class="note">Medians over the runs, from trigger to release '
+    yield "against the true compression; the ratio is the paper's RMSE by its own in the same run, with the interval "
+    yield "that holds its median with 95 % confidence. "
+    if summary.watched_s:
+        yield f"The trigger was watched for {summary.watched_s:.0f} s with nothing touching: "
+        yield f"{summary.false_contacts} false contacts; the last two columns say what each read meanwhile, and how "
+        yield "often it alone would have pulled the trigger."
+    yield "</p><table><tr><th>estimator</th>"
+    yield "".join(f'<th class="n">{heading}</th>' for heading in SIDE_HEADINGS) + "</tr>"
+    for label, cells in side_rows(summary):
+        yield f"<tr><td>{escape(label)}</td>" + "".join(f'<td class="n">{cell}</td>' for cell in cells) + "</tr>"
+    yield "</table>"
+
+
+SIDE_HEADINGS: Final = ("runs", "RMSE, N", "bias, N", "delay, ms", "paper by own", "watched, N", "pulls")
+
+
+def side_rows(summary: Summary) -> list[tuple[str, list[str]]]:
+    """Label and cells (``SIDE_HEADINGS``) of each estimator; empty what no run tells."""
+
+    def cell(value: float | None, form: str, factor: float = 1.0) -> str:
+        return "" if value is None else f"{factor * value:{form}}"
+
+    rows = []
+    for side in summary.estimators:
+        ratio = cell(side.ratio, ".2f")
+        if side.ratio_low is not None and side.name != "paper":
+            ratio += f" ({cell(side.ratio_low, '.2f')} to {cell(side.ratio_high, '.2f')})"
+        cells = [
+            str(side.runs), cell(side.rmse, ".3f"), cell(side.bias, "+.3f"), cell(side.delay, ".0f", 1000.0), ratio,
+            cell(side.watched_rms, ".3f"), str(side.pulls) if side.watched_rms is not None else "",
+        ]  # fmt: skip
+        rows.append((LABELS[side.name], cells))
+    return rows
+
+
 def _distributions(summary: Summary, table: pa.Table) -> Iterator[str]:
     yield '<h2>Distributions</h2><div class="pair">'
     for figure in FIGURES:
         spread = summary.figures.get(figure.name)
-        if spread is None or spread.high - spread.low < 1e-9 * max(1.0, abs(spread.high)):
+        if not figure.charted or spread is None or spread.high - spread.low < 1e-9 * max(1.0, abs(spread.high)):
             continue
         values = column(table, figure.name)
         counts, edges = np.histogram(values[np.isfinite(values)], bins=min(_BINS, max(6, spread.count // 4)))

@@ -15,7 +15,8 @@ from msgspec import Struct
 
 from groundstation import metrics
 from groundstation.campaign_file import Job
-from groundstation.run import Gathering, Run
+from groundstation.estimators import LABELS
+from groundstation.run import ESTIMATORS, FELT, Gathering, Run
 from onboard.headless import ConfigError, InfeasibleError, Mission
 from onboard.messages import PARAMS, Phase
 
@@ -30,8 +31,18 @@ class Figure(Struct, frozen=True):
     name: str
     unit: str
     words: str
+    charted: bool = True
+    """The report shows its distribution."""
 
 
+#: What is kept of each force estimator: key in ``metrics.json``, unit, words.
+OF_ESTIMATORS: Final = (
+    ("rmse", "N", "RMSE in contact"),
+    ("bias", "N", "bias in contact"),
+    ("delay", "s", "delay in contact"),
+    ("watched_rms", "N", "RMS with the trigger watched and nothing touching"),
+    ("pulls", "", "times it alone would then have pulled the trigger"),
+)
 FIGURES: Final = (
     Figure("meas_des", "N", "measured less desired force in contact, RMSE"),
     Figure("est_des", "N", "estimated less desired force in contact, RMSE"),
@@ -49,6 +60,13 @@ FIGURES: Final = (
     Figure("path_error_rms", "m", "needle off its path, RMS"),
     Figure("estimator_gain", "", "the paper's estimator's RMSE by that of the selected one"),
     Figure("false_contacts", "", "contacts that the trigger saw and were none"),
+    Figure("alarms", "", "contacts that it would have seen in free flight, had the tip been at the crack"),
+    Figure("watched_s", "s", "time with the gate of the trigger open and nothing touching"),
+    *(
+        Figure(f"{name}_{key}", unit, f"{LABELS[name]}: {words}", charted=False)
+        for name in (*ESTIMATORS, FELT)
+        for key, unit, words in OF_ESTIMATORS
+    ),
     Figure("sim_s", "s", "simulated time"),
     Figure("wall_s", "s", "time it took"),
     Figure("speed", "", "times real time"),
@@ -148,7 +166,12 @@ def _told(run: Run, figures: dict[str, Any]) -> dict[str, Any]:
         "torque_max": limits["torque_max"],
         "path_error_rms": figures["adhesive"]["path_error_rms"],
         "estimator_gain": estimators.get("ratio"),
-        "false_contacts": estimators.get("false_contacts"),
+        **{name: estimators.get(name) for name in ("false_contacts", "alarms", "watched_s")},
+        **{
+            f"{name}_{key}": row[key]
+            for name, row in estimators.get("table", {}).items()
+            for key, _, _ in OF_ESTIMATORS
+        },
         "sim_s": figures["sim_s"],
     }
 
