@@ -229,7 +229,9 @@ def _sides(table: pa.Table) -> Iterator[Side]:
         yield Side(
             name=name,
             runs=int(np.isfinite(of["rmse"]).sum()),
-            **{key: _median(of[key]) for key in ("rmse", "bias", "delay")},
+            rmse=_median(of["rmse"]),
+            bias=_median(of["bias"]),
+            delay=_median(of["delay"]),
             ratio=_median(ratios),
             ratio_low=low,
             ratio_high=high,
