@@ -18,11 +18,11 @@ import msgspec
 from msgspec import Meta, Struct
 
 from groundstation.parsing import nearest
+from groundstation.shipped import Shipped
 from onboard.headless import ConfigError, InfeasibleError, Mission, find, inline_text, read_struct
 from onboard.messages import Phase
 
-#: Where those lie that are shipped.
-SHIPPED: Final = Path(__file__).resolve().parent.parent / "configs" / "campaigns"
+SHIPPED: Final = Shipped("campaign", "campaigns")
 
 
 def _note(meaning: str, unit: str = "") -> Meta:
@@ -278,7 +278,7 @@ def read_campaign(given: str, figures: Sequence[str], ends: Sequence[str]) -> Pl
 
     figures, ends: the names that metrics and ends may have. Raises ConfigError with every error at once.
     """
-    path = _path(given)
+    path = SHIPPED.path(given)
     campaign = read_struct(Campaign, path)
     plan = Plan(path.stem, campaign)
     errors = _wrong_names(campaign, figures, ends, path) or _wrong_points(plan, path)
@@ -286,21 +286,6 @@ def read_campaign(given: str, figures: Sequence[str], ends: Sequence[str]) -> Pl
         raise ConfigError(errors)
     base = Mission(campaign.scenario, campaign.law, campaign.set, campaign.first_seed).yaml
     return Plan(path.stem, campaign, base)
-
-
-def shipped() -> list[str]:
-    """Names of the campaigns that exist."""
-    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
-
-
-def _path(given: str) -> Path:
-    if "/" in given or given.endswith((".yaml", ".yml")):
-        return Path(given)
-    path = SHIPPED / f"{given}.yaml"
-    if not path.is_file():
-        known = nearest(given, shipped()) or shipped()
-        raise ConfigError([f"{given}: no campaign of that name; there are: {', '.join(known)}; or give a file"])
-    return path
 
 
 def _wrong_names(campaign: Campaign, figures: Sequence[str], ends: Sequence[str], path: Path) -> list[str]:

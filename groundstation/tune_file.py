@@ -15,9 +15,10 @@ from msgspec.structs import replace
 from groundstation.campaign_file import Job, Plan, read_campaign
 from groundstation.campaign_run import ENDS, NAMES, SUCCESS
 from groundstation.parsing import nearest
+from groundstation.shipped import Shipped
 from onboard.headless import ConfigError, Mission, Range, inline_text, range_of, read_struct
 
-SHIPPED: Final = Path(__file__).resolve().parent.parent / "configs" / "tunings"
+SHIPPED: Final = Shipped("tuning", "tunings")
 
 
 def _note(meaning: str, unit: str = "") -> Meta:
@@ -88,7 +89,7 @@ class Study(Struct, frozen=True):
 
 def read_tuning(given: str) -> Study:
     """Read a tuning by the name of a shipped one, or from a file. Raises ConfigError with every error at once."""
-    path = _path(given)
+    path = SHIPPED.path(given)
     tuning = read_struct(Tuning, path)
     plan = read_campaign(_beside(path, tuning.campaign), NAMES, tuple(ENDS))
     errors: list[str] = []
@@ -120,21 +121,6 @@ def present(study: Study) -> dict[str, Any]:
         if (value := config.value(name)) in bounds.choices
         or (not bounds.choices and bounds.low <= value <= bounds.high)
     }
-
-
-def shipped() -> list[str]:
-    """Names of the tunings that exist."""
-    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
-
-
-def _path(given: str) -> Path:
-    if "/" in given or given.endswith((".yaml", ".yml")):
-        return Path(given)
-    path = SHIPPED / f"{given}.yaml"
-    if not path.is_file():
-        known = nearest(given, shipped()) or shipped()
-        raise ConfigError([f"{given}: no tuning of that name; there are: {', '.join(known)}; or give a file"])
-    return path
 
 
 def _beside(path: Path, campaign: str) -> str:

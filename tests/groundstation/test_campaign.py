@@ -32,6 +32,7 @@ from groundstation import (
     metrics,
 )
 from groundstation.campaign_file import (
+    SHIPPED,
     Campaign,
     Design,
     FaultCase,
@@ -42,7 +43,6 @@ from groundstation.campaign_file import (
     Spread,
     Varied,
     read_campaign,
-    shipped,
 )
 from groundstation.campaign_pool import Pool
 from groundstation.campaign_run import ENDS, NAMES, flown
@@ -72,7 +72,7 @@ def read(given: str) -> Plan:
 # --- the file ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", SHIPPED.names())
 def test_what_is_shipped_can_be_flown(name: str) -> None:
     plan = read(name)
     assert len(plan) == {"realistic": 100, "robustness": 500, "gusts": 6}.get(name, len(plan))

@@ -11,7 +11,7 @@ import pytest
 
 from groundstation import campaign_pool, campaign_run, cli, codes
 from groundstation.campaign_file import Job
-from groundstation.tune_file import Objective, read_tuning, shipped
+from groundstation.tune_file import SHIPPED, Objective, read_tuning
 from onboard.config import load_config
 from onboard.headless import ConfigError, range_of
 
@@ -151,7 +151,7 @@ def test_bounds_come_from_the_declarations() -> None:
     assert range_of("observer.tare").choices == (False, True)
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", SHIPPED.names())
 def test_what_is_shipped_can_be_tuned(name: str) -> None:
     study = read_tuning(name)
     assert study.jobs({})[0].scenario
