@@ -179,7 +179,7 @@ def _say(summary: Summary, folder: Path, console: Any) -> None:
         soft_wrap=True,
     )
     if summary.estimators:
-        console.print(_side_by_side(summary))
+        console.print(side_by_side(summary))
     if summary.watched_s:
         console.print(
             f"False contacts: {summary.false_contacts}, in {summary.watched_s:.0f} s with the trigger watched "
@@ -198,17 +198,17 @@ def _say(summary: Summary, folder: Path, console: Any) -> None:
     console.print(f"\nreport: {folder / 'report.html'}", soft_wrap=True)
 
 
-def _side_by_side(summary: Summary) -> Any:
-    """The table of the force estimators."""
-    from rich.table import Table
+def side_by_side(summary: Summary) -> Any:
+    """The table of the force estimators; it fits a terminal of 80 columns."""
+    from groundstation import campaign_report
+    from groundstation.terminal import ruled
 
-    from groundstation.campaign_report import SIDE_HEADINGS, side_rows
-
-    table = Table(title="Force estimators, medians over the runs", title_justify="left")
+    headings, rows = campaign_report.side_by_side(summary)
+    table = ruled("Force estimators, medians", gap=0)
     table.add_column("")
-    for heading in SIDE_HEADINGS:
-        table.add_column(heading, justify="right")
-    for label, cells in side_rows(summary):
+    for heading in headings:
+        table.add_column(heading.replace(", ", ",\n"), justify="right")
+    for label, cells in rows:
         table.add_row(label, *cells)
     return table
 

@@ -20,7 +20,7 @@ from groundstation.run import ESTIMATORS, FELT, Gathering, Run
 from onboard.headless import ConfigError, InfeasibleError, Mission
 from onboard.messages import PARAMS, Phase
 
-#: What is kept of one process flies one mission at a time, however many threads it has.
+#: One process flies one mission at a time, however many threads it has.
 _ALONE: Final = threading.Lock()
 _AIRBORNE: Final = tuple(phase for phase in Phase if phase not in (Phase.PREFLIGHT, Phase.ARMED, Phase.STOPPED))
 
@@ -61,7 +61,7 @@ FIGURES: Final = (
     Figure("estimator_gain", "", "the paper's estimator's RMSE by that of the selected one"),
     Figure("false_contacts", "", "contacts that the trigger saw and were none"),
     Figure("alarms", "", "contacts that it would have seen in free flight, had the tip been at the crack"),
-    Figure("watched_s", "s", "time with the gate of the trigger open and nothing touching"),
+    Figure("watched_s", "s", "time that the trigger was watched, nothing touching"),
     *(
         Figure(f"{name}_{key}", unit, f"{LABELS[name]}: {words}", charted=False)
         for name in (*ESTIMATORS, FELT)

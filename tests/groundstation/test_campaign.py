@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import shlex
@@ -19,9 +20,11 @@ import psutil
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from rich.console import Console
 from scipy.stats import binomtest
 
 from groundstation import (
+    campaign,
     campaign_figures,
     campaign_pool,
     campaign_report,
@@ -394,17 +397,21 @@ def test_the_estimators_are_told_side_by_side(tmp_path: Path) -> None:
     assert (paper.name, paper.runs, paper.ratio, paper.watched_rms) == ("paper", 9, 1.0, None)
     assert (kalman.name, kalman.runs, kalman.rmse, kalman.bias, kalman.delay) == ("kalman", 8, 0.1, -0.02, 0.05)
     assert kalman.ratio == pytest.approx(2.35)
-    assert (kalman.ratio_low, kalman.ratio_high) == (pytest.approx(2.0), pytest.approx(2.7)), "of eight: all of them"
+    assert [kalman.ratio_low, kalman.ratio_high] == pytest.approx([2.0, 2.7]), "of eight: all of them"
     assert kalman.watched_rms == pytest.approx(np.sqrt(0.5 * (0.03**2 + 0.04**2)))
     assert kalman.pulls == 1
     page = tmp_path / "report.html"
     campaign_report.write(summary, store.table(), page)
     for words in (
         "2.35 (2.00 to 2.70)",
-        "watched for 800 s with nothing touching: 1 false contacts",
+        "watched for 800 s with nothing touching, false contacts: 1;",
         "Kalman, wind apart",
     ):
         assert words in page.read_text()
+    printed = io.StringIO()
+    Console(width=80, file=printed).print(campaign.side_by_side(summary))
+    one_line = r"Kalman, wind apart +8 0\.100 -0\.020 +50 2\.35 \(2\.00 to 2\.70\) +0\.035 +1 *$"
+    assert re.search(one_line, printed.getvalue(), re.MULTILINE)
     assert campaign_summary.summarize(plan_of(3), store.table().slice(0, 3)).estimators[1].ratio_low is None
 
 
