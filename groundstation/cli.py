@@ -205,6 +205,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _sim(options: argparse.Namespace) -> int:
+    _can_report()
     begun, out = time.perf_counter(), _out(options)
     before = _written(out / "log.mcap")
     code = _flight_process(["sim", "--out", str(out), *_common(options), *_run_options(options)])
@@ -212,6 +213,7 @@ def _sim(options: argparse.Namespace) -> int:
 
 
 def _desk(options: argparse.Namespace) -> int:
+    _can_report()
     begun, out = time.perf_counter(), _out(options)
     before = _written(out / "log.mcap")
     mission = [] if options.no_autostart else ["--mission"]
@@ -289,6 +291,11 @@ def _report(options: argparse.Namespace) -> int:
     beside = [_log(path) for path in options.beside]
     _evaluate(_log(options.log), partial=options.partial, beside=beside)
     return DONE
+
+
+def _can_report() -> None:
+    """What a flight's figures are told with is there; found out before it has flown."""
+    import rich.console  # noqa: F401
 
 
 def _evaluate(log: Path, *, partial: bool, begun: float | None = None, beside: Sequence[Path] = ()) -> str:

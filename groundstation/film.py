@@ -147,6 +147,7 @@ class _Studio:
         from sim_backend.bullet_scene import Scene
         from sim_backend.deviations import DeviationParams, deviations
         from sim_backend.picture import Camera
+        from sim_backend.pipe import Pipe
 
         # A run's configuration was checked when it was flown.
         config = yaml.safe_load(run.config_yaml)
@@ -156,10 +157,11 @@ class _Studio:
         if run.truth is not None:
             sizes = msgspec.convert(config.get("world", {}).get("deviations", {}), DeviationParams)
         self._left_on_pipe = run.truth is None or run.truth.sleeve_on_pipe
-        self._pipe, self._heading = deviations(sizes, run.info.seed).pipe_pose(pipe.position, radians(pipe.heading_deg))
+        believed = Pipe(pipe.position, radians(pipe.heading_deg), pipe.radius, pipe.length)
+        self._pipe = deviations(sizes, run.info.seed).pipe_of(believed)
         self.size = (width, round(width * 9 / 16))
         self.scene: Scene = Scene(vehicle, bars=True)
-        self.scene.put_pipe(self._pipe, self._heading, pipe.radius, pipe.length)
+        self.scene.put_pipe(self._pipe)
         self._camera = Camera(self.scene, *self.size)
 
     def __enter__(self) -> _Studio:
@@ -183,8 +185,8 @@ class _Studio:
                 self.scene.release_sleeve(on_pipe=True)
             else:
                 self.scene.take_sleeve()
-        ahead = self._heading
-        gap = (self._pipe[0] - pose.position[0]) * cos(ahead) + (self._pipe[1] - pose.position[1]) * sin(ahead)
+        ahead, (x, y, _) = self._pipe.heading, self._pipe.position
+        gap = (x - pose.position[0]) * cos(ahead) + (y - pose.position[1]) * sin(ahead)
         # Near the pipe both fit into a narrow picture; far from it the vehicle is what counts.
         near = min(max((1.6 - gap) / 0.8, 0.0), 1.0)
         lead = 0.3 * near

@@ -25,6 +25,7 @@ from onboard.device_config import Kind
 from onboard.layers import ConfigError
 from sim_backend.faults import Faults
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
+from sim_backend.pipe import Pipe
 from sim_backend.software_camera import SoftwareCamera
 from sim_backend.world import World
 from sim_backend.world_client import LinkedAutopilot, LinkedOdometry, LinkedServos, WorldClient
@@ -55,9 +56,9 @@ class DeviceSet:
 def world_of(config: Config) -> World:
     """The simulated world of a configuration. Raises ConfigError for one that cannot be had."""
     pipe = config.pipe
-    heading = radians(pipe.heading_deg)
+    believed = Pipe(pipe.position, radians(pipe.heading_deg), pipe.radius, pipe.length)
     try:
-        return World(config.vehicle, config.world, pipe.position, heading, pipe.radius, pipe.length, config.seed)
+        return World(config.vehicle, config.world, believed, config.seed)
     except ValueError as error:
         raise ConfigError([str(error)]) from error
 

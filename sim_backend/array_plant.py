@@ -19,6 +19,7 @@ from sim_backend.deviations import AS_MODELLED, Deviations
 from sim_backend.dynamics import lump
 from sim_backend.knob import knob, switch
 from sim_backend.motors import lag_gain, rated_voltage
+from sim_backend.pipe import Pipe
 from sim_backend.plant import Actuation, Truth
 
 Array = NDArray[np.float64]
@@ -100,16 +101,13 @@ class PlantParams(Struct, frozen=True, forbid_unknown_fields=True):
 def constants(
     vehicle: Vehicle,
     params: PlantParams,
-    pipe_position: Vec3,
-    pipe_heading: float,
-    pipe_radius: float,
-    pipe_length: float,
+    pipe: Pipe,
     truth: Deviations = AS_MODELLED,
 ) -> Array:
     """Array ``p`` for a vehicle and a pipe (without the autopilot's gains), both off by ``truth``."""
     p = np.zeros(at.CONSTANTS_SIZE)
     centre, vehicle = truth.base_centre(vehicle), truth.vehicle(vehicle)
-    pipe_position, pipe_heading = truth.pipe_pose(pipe_position, pipe_heading)
+    pipe = truth.pipe_of(pipe)
     base, rotor, arm, servo, cell = vehicle.base, vehicle.rotors, vehicle.arm, vehicle.servo, vehicle.battery
     contact, ground, step = params.contact, params.ground, params.physics_step
 
@@ -128,8 +126,8 @@ def constants(
     put(at.SERVO_STIFFNESS, servo.stiffness, servo.damping, float(params.ideal_servos))
     put(at.BACKLASH, 0.5 * params.backlash, params.gear_stiffness, params.gear_damping, servo.rotor_inertia)
     put(at.TOOL_SERVO_GAIN, lag_gain(step, params.tool_servo_time))
-    put(at.PIPE_POINT, *pipe_position, cos(pipe_heading), sin(pipe_heading), pipe_radius)
-    put(at.PIPE_HALF_LENGTH, 0.5 * pipe_length)
+    put(at.PIPE_POINT, *pipe.position, cos(pipe.heading), sin(pipe.heading), pipe.radius)
+    put(at.PIPE_HALF_LENGTH, 0.5 * pipe.length)
     put(at.CONTACT_STIFFNESS, contact.stiffness, contact.damping)
     put(at.CONTACT_TANGENTIAL_STIFFNESS, contact.tangential_stiffness, contact.tangential_damping)
     put(at.CONTACT_STATIC, contact.friction_static, contact.friction_kinetic, contact.release_angle)
@@ -157,10 +155,8 @@ class ArrayPlant(ABC):
     """A vehicle and one horizontal pipe, told by the arrays ``x``, ``p`` and ``u`` of ``layout``; a ``Plant``.
 
     It starts standing at the origin of W, at rest, arm folded and held by its servos, sleeve in the gripper.
-    ``pipe_position`` (m, W) is the middle of the pipe's axis, ``pipe_heading`` (rad) the horizontal direction in
-    which the vehicle presses, to which the axis is square; ``pipe_radius`` and ``pipe_length`` in m. Vehicle and pipe
-    are those of the model; they really are off by ``truth``. What is written into the arrays between two advances
-    holds.
+    Vehicle and pipe are those of the model; they really are off by ``truth``. What is written into the arrays between
+    two advances holds.
     """
 
     #: Time the vehicle is given to settle on its skids before the start, s.
@@ -170,17 +166,14 @@ class ArrayPlant(ABC):
         self,
         vehicle: Vehicle,
         params: PlantParams,
-        pipe_position: Vec3,
-        pipe_heading: float,
-        pipe_radius: float,
-        pipe_length: float,
+        pipe: Pipe,
         truth: Deviations = AS_MODELLED,
     ) -> None:
         self.vehicle = vehicle
         self.params = params
         #: Physics step, s.
         self.step = params.physics_step
-        self.p = constants(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
+        self.p = constants(vehicle, params, pipe, truth)
         self.x = np.zeros(at.STATE_SIZE)
         self.u = np.zeros(at.DRIVE_SIZE)
         self.steps = 0

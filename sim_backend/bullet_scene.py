@@ -17,6 +17,7 @@ from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.array_plant import PlantParams
 from sim_backend.lumping import DRIVEN, SLEEVE, gears
+from sim_backend.pipe import Pipe
 from sim_backend.urdf import BARS, urdf
 
 #: Share of a gear's angle error that is taken back in one step.
@@ -147,18 +148,21 @@ class Scene:
         contact = params.contact
         self._contact = (contact.stiffness, contact.damping, contact.friction_static)
 
-    def put_pipe(self, position: Vec3, heading: float, radius: float, length: float) -> None:
-        """Lay the pipe: the middle of its axis (m), the heading it is square to (rad), radius and length (m)."""
+    def put_pipe(self, pipe: Pipe) -> None:
+        """Lay the pipe."""
         bullet, client = self.bullet, self.client
-        shape = bullet.createCollisionShape(bullet.GEOM_CAPSULE, radius=radius, height=length, physicsClientId=client)
+        shape = bullet.createCollisionShape(
+            bullet.GEOM_CAPSULE, radius=pipe.radius, height=pipe.length, physicsClientId=client
+        )
         look = bullet.createVisualShape(
             bullet.GEOM_CYLINDER,
-            radius=radius,
-            length=length,
+            radius=pipe.radius,
+            length=pipe.length,
             rgbaColor=(0.55, 0.58, 0.60, 1.0),
             physicsClientId=client,
         )
-        self.pipe = bullet.createMultiBody(0.0, shape, look, position, self._across(heading), physicsClientId=client)
+        turn = self._across(pipe.heading)
+        self.pipe = bullet.createMultiBody(0.0, shape, look, pipe.position, turn, physicsClientId=client)
         for link in range(-1, self._count):
             touches = link == self._links["tool"]
             bullet.setCollisionFilterPair(self.vehicle, self.pipe, link, -1, int(touches), physicsClientId=client)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from sim_backend.knob import knob
+from sim_backend.pipe import Pipe
 
 #: Waves that make up the unevenness of a pipe's friction.
 WAVES = 4
@@ -63,11 +64,11 @@ class Deviations(Struct, frozen=True):
         share = mass_of(model) * self.mass / self.vehicle(model).base.mass
         return (self.centre[0] * share, self.centre[1] * share, self.centre[2] * share)
 
-    def pipe_pose(self, position: Vec3, heading: float) -> tuple[Vec3, float]:
-        """Where the pipe really is, m, W, and its true heading, rad."""
-        ahead, up, turn = self.pipe
-        x, y, z = position
-        return (x + ahead * cos(heading), y + ahead * sin(heading), z + up), heading + turn
+    def pipe_of(self, model: Pipe) -> Pipe:
+        """The pipe where it really is."""
+        (ahead, up, turn), (x, y, z), heading = self.pipe, model.position, model.heading
+        place = (x + ahead * cos(heading), y + ahead * sin(heading), z + up)
+        return replace(model, position=place, heading=heading + turn)
 
 
 AS_MODELLED = Deviations()

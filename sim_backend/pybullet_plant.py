@@ -16,7 +16,6 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.airframe import airframe
@@ -27,6 +26,7 @@ from sim_backend.contact import FREE, SLIDE, STICK, grip
 from sim_backend.deviations import AS_MODELLED, Deviations
 from sim_backend.inner_loops import inner_loops
 from sim_backend.motors import battery
+from sim_backend.pipe import Pipe
 from sim_backend.rigid_body import let_go, rotation, tips, watch
 from sim_backend.servos import joint_torque, stop_torque, tool_servos
 
@@ -158,17 +158,14 @@ class PyBulletPlant(ArrayPlant):
         self,
         vehicle: Vehicle,
         params: PlantParams,
-        pipe_position: Vec3,
-        pipe_heading: float,
-        pipe_radius: float,
-        pipe_length: float = 2.0,
+        pipe: Pipe,
         truth: Deviations = AS_MODELLED,
     ) -> None:
-        super().__init__(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
+        super().__init__(vehicle, params, pipe, truth)
         servo = replace(vehicle.servo, rotor_inertia=params.rotor_inertia(vehicle))
         self._real = replace(truth.vehicle(vehicle), servo=servo)
         self._centre = np.array(truth.base_centre(vehicle))
-        self._pipe = (*truth.pipe_pose(pipe_position, pipe_heading), pipe_radius, pipe_length)
+        self._pipe = truth.pipe_of(pipe)
         self._build()
         self.stand()
 
@@ -188,7 +185,7 @@ class PyBulletPlant(ArrayPlant):
         self._finalizer = weakref.finalize(self, scene.close)
         self._bullet: Any = scene.bullet
         scene.prepare(self.params, self.step)
-        scene.put_pipe(*self._pipe)
+        scene.put_pipe(self._pipe)
         self._out = np.zeros(_DRIVE_SIZE)
         self._moved = np.zeros(_MOVED_SIZE)
         self._known_x = np.full(at.ACCELERATION, nan)

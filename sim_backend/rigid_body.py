@@ -12,7 +12,6 @@ from math import cos, hypot, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.samples import Vec3
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.airframe import airframe
@@ -23,6 +22,7 @@ from sim_backend.deviations import AS_MODELLED, Deviations
 from sim_backend.dynamics import accelerations
 from sim_backend.inner_loops import inner_loops
 from sim_backend.motors import Nine, battery
+from sim_backend.pipe import Pipe
 from sim_backend.servos import joint_torque, stop_torque, tool_servos
 
 Array = NDArray[np.float64]
@@ -332,13 +332,10 @@ class RigidBody(ArrayPlant):
         self,
         vehicle: Vehicle,
         params: PlantParams,
-        pipe_position: Vec3,
-        pipe_heading: float,
-        pipe_radius: float,
-        pipe_length: float = 2.0,
+        pipe: Pipe,
         truth: Deviations = AS_MODELLED,
     ) -> None:
-        super().__init__(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
+        super().__init__(vehicle, params, pipe, truth)
         self.stand()
 
     def move(self, steps: int) -> None:

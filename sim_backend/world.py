@@ -8,13 +8,14 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from drivers.samples import JointMode, ServoCommand, Vec3
+from drivers.samples import JointMode, ServoCommand
 from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.array_plant import ArrayPlant, PlantKind, PlantParams, truth_of
 from sim_backend.autopilot import Autopilot, AutopilotParams
 from sim_backend.deviations import AS_MODELLED, DeviationParams, Deviations, deviations
 from sim_backend.inner_loops import LoopParams, put_loops
+from sim_backend.pipe import Pipe
 from sim_backend.plant import Truth
 from sim_backend.rigid_body import RigidBody
 from sim_backend.sensors import SensorParams, Sensors, Snapshot
@@ -43,28 +44,23 @@ class WorldParams(Struct, frozen=True, forbid_unknown_fields=True):
 def plant_of(
     vehicle: Vehicle,
     params: PlantParams,
-    pipe_position: Vec3,
-    pipe_heading: float,
-    pipe_radius: float,
-    pipe_length: float,
+    pipe: Pipe,
     truth: Deviations = AS_MODELLED,
 ) -> ArrayPlant:
     """The plant of the kind that ``params`` asks for; ValueError when this machine cannot have it."""
     if params.kind is PlantKind.RIGID:
-        return RigidBody(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
+        return RigidBody(vehicle, params, pipe, truth)
     # Imported here since not every machine that flies has PyBullet.
     from sim_backend.pybullet_plant import PyBulletPlant
 
-    return PyBulletPlant(vehicle, params, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
+    return PyBulletPlant(vehicle, params, pipe, truth)
 
 
 class World:
     """A vehicle, a pipe, and time. Deterministic: same seed and calls, same bits.
 
-    ``pipe_position`` (m, W) is the middle of the pipe's axis, ``pipe_heading`` (rad) the horizontal direction in
-    which the vehicle presses (the axis is square to it), ``pipe_radius`` and ``pipe_length`` in m. The vehicle starts
-    at rest on the ground at the origin, disarmed, the sleeve in the gripper, the arm folded and held by its servos
-    until they are commanded.
+    The vehicle starts at rest on the ground at the origin, disarmed, the sleeve in the gripper, the arm folded and held
+    by its servos until they are commanded. ``vehicle`` and ``pipe`` are what is believed of them.
 
     One thread advances the world; others may read ``snapshot`` and ``truth`` and command the servos meanwhile.
     """
@@ -73,17 +69,14 @@ class World:
         self,
         vehicle: Vehicle,
         params: WorldParams | None = None,
-        pipe_position: Vec3 = (2.0, 0.0, 1.5),
-        pipe_heading: float = 0.0,
-        pipe_radius: float = 0.08,
-        pipe_length: float = 2.0,
+        pipe: Pipe | None = None,
         seed: int = 0,
     ) -> None:
         self.vehicle = vehicle
         self.params = params = params or WorldParams()
         #: How the true vehicle and pipe differ from ``vehicle`` and the pipe that was asked for.
         self.deviations = truth = deviations(params.deviations, seed)
-        self.plant = plant_of(vehicle, params.plant, pipe_position, pipe_heading, pipe_radius, pipe_length, truth)
+        self.plant = plant_of(vehicle, params.plant, pipe or Pipe(), truth)
         put_loops(self.plant.p, vehicle, params.loops, self.plant.step)
         self.autopilot = Autopilot(params.autopilot, seed)
         self.wind = Wind(params.wind, seed)

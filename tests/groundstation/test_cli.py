@@ -253,10 +253,14 @@ def test_interrupts_reach_the_flight_process_once(monkeypatch: pytest.MonkeyPatc
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.parametrize("command", ["sim", "desk", "report"])
 def test_a_package_that_is_not_installed_is_named_with_its_extra(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    command: str, flight: list[list[str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Before anything has flown, not after."""
     monkeypatch.setitem(sys.modules, "rich", None)
     monkeypatch.setitem(sys.modules, "rich.console", None)
-    assert cli.main(["report", str(tmp_path)]) == BROKEN
+    assert cli.main([command] if command != "report" else ["report", "."]) == BROKEN
     assert "pip install 'pipewright[ground]'" in capsys.readouterr().err
+    assert not flight
+    assert not Path("runs").exists()

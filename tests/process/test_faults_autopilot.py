@@ -137,7 +137,7 @@ def test_reboot(book: Book) -> None:
     told.says(OLD, *LOST, "the link to PX4 is lost", "PX4 has rebooted: its time began anew")
     told.says("the link to PX4 is back")
     assert "autopilot_lost" in told.demands
-    assert told.phases[:2] == [Phase.PREFLIGHT, Phase.TAKEOFF]
+    assert Phase.TAKEOFF in told.phases
     assert told.phases[-2:] == [Phase.LAND, Phase.STOPPED]
 
 

@@ -13,14 +13,16 @@ from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.array_plant import BulletParams, PlantKind, PlantParams
 from sim_backend.mock_devices import MockAutopilot, MockOdometry, MockServos
+from sim_backend.pipe import Pipe
 from sim_backend.pybullet_plant import PyBulletPlant
 from sim_backend.rigid_body import RigidBody
 from sim_backend.world import World, WorldParams
 
 TICK = 0.004
 REACH = (-1.0, 1.0, 0.0)
-PIPE = (2.0, 0.0, 1.5)
-RADIUS = 0.08
+PIPE = Pipe()
+#: Where the pipe begins, m, W.
+SURFACE = PIPE.position[0] - PIPE.radius
 
 
 def mass_of(vehicle: Vehicle) -> float:
@@ -41,10 +43,14 @@ def plant_at(
     vehicle: Vehicle, params: PlantParams, joints: Vec3 = REACH, gap: float = 1.0, velocity: Vec3 = (0.0, 0.0, 0.0)
 ) -> RigidBody:
     """A plant in the air, level and free of gravity and drag, torque off, the tip ``gap`` before the pipe (m)."""
-    plant = RigidBody(vehicle, params, PIPE, 0.0, RADIUS)
+    plant = RigidBody(vehicle, params, PIPE)
     tip = tip_in_body(vehicle, joints)
     x, p, u = plant.x, plant.p, plant.u
-    x[at.POSITION : at.POSITION + 3] = (PIPE[0] - RADIUS - gap - tip[0], -tip[1], PIPE[2] - tip[2])
+    x[at.POSITION : at.POSITION + 3] = (
+        SURFACE - gap - tip[0],
+        -tip[1],
+        PIPE.position[2] - tip[2],
+    )
     x[at.VELOCITY : at.VELOCITY + 3] = velocity
     x[at.ATTITUDE : at.ATTITUDE + 4] = (1.0, 0.0, 0.0, 0.0)
     x[at.RATE : at.RATE + 3] = 0.0
@@ -64,7 +70,7 @@ def to_bullet(world: World) -> PyBulletPlant:
     where = (float(p[at.PIPE_POINT]), float(p[at.PIPE_POINT + 1]), float(p[at.PIPE_POINT + 2]))
     params = msgspec.structs.replace(one.params, kind=PlantKind.PYBULLET)
     heading, radius = atan2(normal[1], normal[0]), float(p[at.PIPE_RADIUS])
-    plant = PyBulletPlant(world.vehicle, params, where, heading, radius, length)
+    plant = PyBulletPlant(world.vehicle, params, Pipe(where, heading, radius, length))
     plant.x[:], plant.u[:], plant.p[at.LOOP :] = x, u, p[at.LOOP :]
     plant.p[at.LOOP_STEPS], plant.x[at.PHASE] = steps, 0.0
     plant.steps = round(world.time / plant.step)
@@ -127,15 +133,15 @@ class Hand:
 
 def world_at_pipe(vehicle: Vehicle, params: WorldParams | None = None, gap: float = 0.02) -> Hand:
     """A hand hovering with the arm stretched out, the tip about ``gap`` before the pipe, m."""
-    world = World(vehicle, params, PIPE, 0.0, RADIUS)
+    world = World(vehicle, params, PIPE)
     hand = Hand(world, Interface.ATTITUDE)
     hand.fly((0.0, 0.0, 1.2), 3.0)
     hand.joints = REACH
     tip = tip_in_body(vehicle, REACH)
-    hand.fly((PIPE[0] - RADIUS - tip[0] - gap - 0.2, 0.0, PIPE[2] - tip[2]), 6.0)
+    hand.fly((SURFACE - tip[0] - gap - 0.2, 0.0, PIPE.position[2] - tip[2]), 6.0)
     x = world.plant.x
-    x[at.POSITION] += PIPE[0] - RADIUS - gap - world.truth().tip_W[0]
+    x[at.POSITION] += SURFACE - gap - world.truth().tip_W[0]
     x[at.POSITION + 1] += -world.truth().tip_W[1]
-    x[at.POSITION + 2] += PIPE[2] - world.truth().tip_W[2]
+    x[at.POSITION + 2] += PIPE.position[2] - world.truth().tip_W[2]
     hand.tick(world.truth().p_WB)
     return hand

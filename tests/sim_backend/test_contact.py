@@ -15,9 +15,10 @@ from sim_backend import layout as at
 from sim_backend.array_plant import PlantParams
 from sim_backend.contact import SLIDE, STICK, ContactParams, GroundParams, friction
 from sim_backend.dynamics import accelerations
+from sim_backend.pipe import Pipe
 from sim_backend.rigid_body import RigidBody
 from sim_backend.world import WorldParams
-from tests.sim_backend.flying import PIPE, RADIUS, frictionless, plant_at, world_at_pipe
+from tests.sim_backend.flying import PIPE, frictionless, plant_at, world_at_pipe
 from tests.sim_backend.test_rigid_body import balance
 
 STEP = 1e-4
@@ -162,15 +163,15 @@ def test_a_lossless_bounce_gives_the_energy_back(vehicle: Vehicle) -> None:
 @pytest.mark.parametrize("heading", [0.0, 0.9, pi / 2, -2.7, pi])
 def test_contact_is_the_same_at_any_heading(vehicle: Vehicle, heading: float) -> None:
     """The force points out of the pipe and against the motion, in whichever direction the pipe lies."""
-    plant = RigidBody(vehicle, PlantParams(), PIPE, heading, RADIUS)
+    plant = RigidBody(vehicle, PlantParams(), Pipe(heading=heading))
     reference = plant_at(vehicle, PlantParams(), gap=-1e-4, velocity=(0.0, 0.05, 0.02))
     c, s = cos(heading), sin(heading)
     plant.x[:] = reference.x
     plant.u[:] = reference.u
     plant.p[at.GRAVITY] = 0.0
     plant.p[at.DRAG : at.DRAG + 3] = 0.0
-    offset, v = reference.x[:3] - np.array(PIPE), reference.x[at.VELOCITY : at.VELOCITY + 3].copy()
-    plant.x[:3] = PIPE + np.array((c * offset[0] - s * offset[1], s * offset[0] + c * offset[1], offset[2]))
+    offset, v = reference.x[:3] - np.array(PIPE.position), reference.x[at.VELOCITY : at.VELOCITY + 3].copy()
+    plant.x[:3] = PIPE.position + np.array((c * offset[0] - s * offset[1], s * offset[0] + c * offset[1], offset[2]))
     plant.x[at.VELOCITY : at.VELOCITY + 3] = (c * v[0] - s * v[1], s * v[0] + c * v[1], v[2])
     plant.x[at.ATTITUDE : at.ATTITUDE + 4] = (cos(heading / 2), 0.0, 0.0, sin(heading / 2))
     for each in (reference, plant):

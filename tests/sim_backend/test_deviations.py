@@ -15,9 +15,10 @@ from sim_backend.array_plant import PlantParams, constants
 from sim_backend.contact import SLIDE, SLIPPERIEST, ContactParams, pipe_contact
 from sim_backend.deviations import AS_MODELLED, DeviationParams, deviations, mass_of
 from sim_backend.motors import near_surfaces
+from sim_backend.pipe import Pipe
 from sim_backend.servos import joint_torque
 from sim_backend.world import World, WorldParams
-from tests.sim_backend.flying import PIPE, RADIUS, REACH, plant_at
+from tests.sim_backend.flying import PIPE, REACH, plant_at
 
 Array = NDArray[np.float64]
 SIZES = DeviationParams(
@@ -29,7 +30,7 @@ def test_by_default_the_truth_is_the_model(vehicle: Vehicle) -> None:
     truth = deviations(DeviationParams(), 7)
     assert msgspec.structs.replace(truth, waves=AS_MODELLED.waves) == AS_MODELLED
     assert truth.vehicle(vehicle) == vehicle
-    assert truth.pipe_pose(PIPE, 0.3) == (PIPE, 0.3)
+    assert truth.pipe_of(Pipe(heading=0.3)) == Pipe(heading=0.3)
 
 
 def test_every_seed_is_off_by_the_whole_size_and_seeds_differ_in_the_sign() -> None:
@@ -49,8 +50,8 @@ def test_the_true_vehicle_weighs_and_balances_as_declared(vehicle: Vehicle) -> N
     """First moment and mass of the world against those of the model, sleeve included."""
     truth = deviations(SIZES, 3)
     base = at.LUMPED + at.LUMPED_SIZE
-    model = constants(vehicle, PlantParams(), PIPE, 0.0, RADIUS, 2.0)
-    real = constants(vehicle, PlantParams(), PIPE, 0.0, RADIUS, 2.0, truth)
+    model = constants(vehicle, PlantParams(), PIPE)
+    real = constants(vehicle, PlantParams(), PIPE, truth)
     masses = model[base + at.L_MASS], real[base + at.L_MASS]
     assert masses[0] == pytest.approx(mass_of(vehicle))
     assert masses[1] == pytest.approx(truth.mass * masses[0])
@@ -77,7 +78,7 @@ def test_the_world_hovers_on_another_thrust_than_the_model_says(vehicle: Vehicle
 
 
 def test_the_pipe_is_not_where_it_is_believed(vehicle: Vehicle) -> None:
-    world = World(vehicle, WorldParams(deviations=SIZES), (2.0, 0.0, 1.5), 0.0, RADIUS, seed=5)
+    world = World(vehicle, WorldParams(deviations=SIZES), PIPE, seed=5)
     p, (ahead, up, turn) = world.plant.p, world.deviations.pipe
     assert p[at.PIPE_POINT : at.PIPE_POINT + 3] == pytest.approx((2.0 + ahead, 0.0, 1.5 + up))
     assert p[at.PIPE_NORMAL : at.PIPE_NORMAL + 2] == pytest.approx((np.cos(turn), np.sin(turn)))
@@ -89,13 +90,13 @@ def test_the_pipe_is_not_where_it_is_believed(vehicle: Vehicle) -> None:
 def grips(vehicle: Vehicle, unevenness: float, seed: int) -> Array:
     """Kinetic friction over normal force at places along a pipe of 2 m, sliding upwards."""
     params = PlantParams(contact=ContactParams(unevenness=unevenness, patch=0.05))
-    p = constants(vehicle, params, PIPE, 0.0, RADIUS, 2.0, deviations(DeviationParams(), seed))
+    p = constants(vehicle, params, PIPE, deviations(DeviationParams(), seed))
     x = np.zeros(at.STATE_SIZE)
     found = []
     for y in np.linspace(-0.95, 0.95, 800):
         x[at.CONTACT_MODE] = SLIDE
         x[at.CONTACT_STRETCH : at.CONTACT_STRETCH + 2] = (1e-5, 0.0)
-        fx, fy, fz = pipe_contact(x, p, (PIPE[0] - RADIUS + 5e-5, y, PIPE[2]), (0.0, 0.0, 0.05))
+        fx, fy, fz = pipe_contact(x, p, (PIPE.position[0] - PIPE.radius + 5e-5, y, PIPE.position[2]), (0.0, 0.0, 0.05))
         found.append(hypot(fy, fz) / abs(fx))
     return np.array(found)
 
@@ -117,7 +118,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def pushed(vehicle: Vehicle, params: PlantParams, place: tuple[float, float, float]) -> Array:
-    p = constants(vehicle, params, PIPE, 0.0, RADIUS, 2.0)
+    p = constants(vehicle, params, PIPE)
     x = np.zeros(at.STATE_SIZE)
     x[at.POSITION : at.POSITION + 3] = place
     x[at.ROTOR : at.ROTOR + 4] = 5.0
@@ -140,13 +141,13 @@ def test_below_half_a_radius_the_lift_grows_no_more(vehicle: Vehicle) -> None:
 
 def test_the_pipe_pulls_more_the_nearer_it_is(vehicle: Vehicle) -> None:
     params = PlantParams(wall_effect=0.02)
-    near, far = (pushed(vehicle, params, (PIPE[0] - gap, 0.0, PIPE[2])) for gap in (0.45, 0.9))
-    front, rear = (gap - RADIUS for gap in (0.45 - vehicle.rotors.arm_x, 0.45 + vehicle.rotors.arm_x))
+    near, far = (pushed(vehicle, params, (PIPE.position[0] - gap, 0.0, PIPE.position[2])) for gap in (0.45, 0.9))
+    front, rear = (gap - PIPE.radius for gap in (0.45 - vehicle.rotors.arm_x, 0.45 + vehicle.rotors.arm_x))
     radius = vehicle.rotors.radius
     assert near[0] == pytest.approx(2.0 * 5.0 * 0.02 * ((radius / front) ** 2 + (radius / rear) ** 2))
     assert near[0] > 3.0 * far[0] > 0.0
     assert near[1:] == pytest.approx(np.zeros(5), abs=1e-12)
-    assert pushed(vehicle, params, (PIPE[0] - 0.45, 3.0, PIPE[2])) == pytest.approx(np.zeros(6))
+    assert pushed(vehicle, params, (PIPE.position[0] - 0.45, 3.0, PIPE.position[2])) == pytest.approx(np.zeros(6))
 
 
 # --- play in the gears ---------------------------------------------------------------------------------------------
@@ -156,7 +157,7 @@ PLAY = PlantParams(backlash=0.0044)
 
 def test_a_torque_that_reverses_crosses_the_play_first(vehicle: Vehicle) -> None:
     """The output held fast: nothing arrives while the motor side crosses the play, then all of it does."""
-    p = constants(vehicle, PLAY, PIPE, 0.0, RADIUS, 2.0)
+    p = constants(vehicle, PLAY, PIPE)
     x, u = np.zeros(at.STATE_SIZE), np.zeros(at.DRIVE_SIZE)
     u[at.U_TORQUE_ON] = 1.0
 
@@ -177,12 +178,12 @@ def test_a_torque_that_reverses_crosses_the_play_first(vehicle: Vehicle) -> None
 
 def test_within_the_play_the_arm_moves_freely(vehicle: Vehicle) -> None:
     """Without torque an output that moves less than the play feels nothing; without play it feels the rotor."""
-    p = constants(vehicle, PLAY, PIPE, 0.0, RADIUS, 2.0)
+    p = constants(vehicle, PLAY, PIPE)
     x, u = np.zeros(at.STATE_SIZE), np.zeros(at.DRIVE_SIZE)
     felt = [joint_torque(x, p, u, 0, 0.0, 0.2 * np.cos(200.0 * k * p[at.STEP])) for k in range(1000)]
     assert set(felt) == {0.0}
     assert p[at.LUMPED + at.L_ROTOR] == 0.0
-    assert constants(vehicle, PlantParams(), PIPE, 0.0, RADIUS, 2.0)[at.LUMPED + at.L_ROTOR] == pytest.approx(1.5e-3)
+    assert constants(vehicle, PlantParams(), PIPE)[at.LUMPED + at.L_ROTOR] == pytest.approx(1.5e-3)
 
 
 def test_play_creates_no_energy(vehicle: Vehicle) -> None:

@@ -17,8 +17,9 @@ from sim_backend import layout as at
 from sim_backend.array_plant import PlantParams, constants
 from sim_backend.autopilot import AutopilotParams, SetPoint
 from sim_backend.inner_loops import LoopParams, airframe_inertia, attitude_rate, mix, put_loops
+from sim_backend.pipe import Pipe
 from sim_backend.world import World, WorldParams
-from tests.sim_backend.flying import PIPE, RADIUS, mass_of
+from tests.sim_backend.flying import PIPE, mass_of
 
 Array = NDArray[np.float64]
 LIMIT = 13.0
@@ -26,7 +27,7 @@ LIMIT = 13.0
 
 @pytest.fixture(scope="module")
 def p(vehicle: Vehicle) -> Array:
-    p = constants(vehicle, PlantParams(), PIPE, 0.0, RADIUS, 2.0)
+    p = constants(vehicle, PlantParams(), PIPE)
     put_loops(p, vehicle, LoopParams(), 1e-4)
     return p
 
@@ -117,7 +118,7 @@ def test_any_attitude_error_shrinks(p: Array, q: Quat, d: Quat) -> None:
 
 def aloft(vehicle: Vehicle, params: WorldParams | None = None) -> World:
     """A world whose vehicle hovers by itself, 20 m up and far from the pipe."""
-    world = World(vehicle, params, (50.0, 0.0, 1.5), 0.0, RADIUS)
+    world = World(vehicle, params, Pipe((50.0, 0.0, 1.5)))
     world.plant.x[at.POSITION + 2] = 20.0
     world.autopilot.armed = True
     world.advance(4.0)

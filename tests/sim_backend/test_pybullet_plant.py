@@ -18,13 +18,13 @@ from sim_backend.plant import Truth
 from sim_backend.pybullet_plant import PyBulletPlant
 from sim_backend.rigid_body import RigidBody
 from sim_backend.world import World, WorldParams
-from tests.sim_backend.flying import PIPE, RADIUS, REACH, Hand, mass_of, to_bullet, world_at_pipe
+from tests.sim_backend.flying import PIPE, REACH, Hand, mass_of, to_bullet, world_at_pipe
 
 BULLET = PlantParams(kind=PlantKind.PYBULLET)
 
 
 def bullet_plant(vehicle: Vehicle, params: PlantParams = BULLET) -> PyBulletPlant:
-    return PyBulletPlant(vehicle, params, PIPE, 0.0, RADIUS)
+    return PyBulletPlant(vehicle, params, PIPE)
 
 
 def moved(plant: ArrayPlant, seconds: float) -> Truth:
@@ -36,7 +36,7 @@ def moved(plant: ArrayPlant, seconds: float) -> Truth:
 
 
 def test_it_stands_as_the_other_does(vehicle: Vehicle) -> None:
-    one = moved(RigidBody(vehicle, PlantParams(), PIPE, 0.0, RADIUS), 0.1)
+    one = moved(RigidBody(vehicle, PlantParams(), PIPE), 0.1)
     other = moved(bullet_plant(vehicle), 0.1)
     assert other.p_WB == pytest.approx(one.p_WB, abs=1e-4)
     assert other.joints == pytest.approx(one.joints, abs=1e-4)
@@ -54,7 +54,7 @@ def test_both_fall_alike(vehicle: Vehicle, off: bool) -> None:
     params = PlantParams(backlash=0.0044, rotor_drag=8e-5) if off else PlantParams()
     found = []
     for kind, plant_type in ((PlantKind.RIGID, RigidBody), (PlantKind.PYBULLET, PyBulletPlant)):
-        plant = plant_type(vehicle, replace(params, kind=kind), PIPE, 0.0, RADIUS, 2.0, truth)
+        plant = plant_type(vehicle, replace(params, kind=kind), PIPE, truth)
         plant.x[at.POSITION + 2] = 10.0
         plant.x[at.RATE : at.RATE + 3] = (0.4, -0.6, 0.3)
         plant.x[at.JOINT_RATE : at.JOINT_RATE + 3] = (1.0, -0.5, 0.8)
@@ -77,7 +77,7 @@ def test_both_hover_and_swing_the_arm_alike(vehicle: Vehicle) -> None:
     """Take off, then swing the arm in flight: position, attitude and joints, each 20 ms."""
     flown = []
     for plant in (PlantParams(), BULLET):
-        hand = Hand(World(vehicle, WorldParams(plant=plant), PIPE, 0.0, RADIUS))
+        hand = Hand(World(vehicle, WorldParams(plant=plant), PIPE))
         rows: list[tuple[float, ...]] = []
         for k in range(800):
             if k == 500:
@@ -144,11 +144,11 @@ def test_a_tip_that_is_pushed_too_hard_slides(vehicle: Vehicle, unevenness: floa
     """Pressed on by 5 N without weight, then pushed along the pipe by more and by less than friction holds."""
     pipe = ContactParams(unevenness=unevenness)
     plant = bullet_plant(vehicle, replace(BULLET, contact=pipe))
-    one = RigidBody(vehicle, PlantParams(contact=pipe), PIPE, 0.0, RADIUS)
+    one = RigidBody(vehicle, PlantParams(contact=pipe), PIPE)
     for each in (plant, one):
         x, p = each.x, each.p
         reach = np.array(each.truth().tip_W) - x[at.POSITION : at.POSITION + 3]
-        x[at.POSITION : at.POSITION + 3] = np.array(PIPE) - (RADIUS, 0.0, 0.0) - reach
+        x[at.POSITION : at.POSITION + 3] = np.array(PIPE.position) - (PIPE.radius, 0.0, 0.0) - reach
         p[at.GRAVITY] = 0.0
         p[at.DRAG : at.DRAG + 3] = 0.0
     found = []
@@ -214,11 +214,11 @@ def test_a_hard_landing_breaks_it(vehicle: Vehicle) -> None:
 def test_without_pybullet_it_says_what_to_do(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(ValueError, match=r"PyBullet is not installed .* or choose rigid"):
-        World(vehicle, WorldParams(plant=BULLET), PIPE, 0.0, RADIUS)
+        World(vehicle, WorldParams(plant=BULLET), PIPE)
 
 
 def test_without_a_screen_it_says_so(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DISPLAY", ":999")
     shown = replace(BULLET, bullet=replace(BULLET.bullet, window=True))
     with pytest.raises(ValueError, match="no window can be opened here"):
-        World(vehicle, WorldParams(plant=shown), PIPE, 0.0, RADIUS)
+        World(vehicle, WorldParams(plant=shown), PIPE)

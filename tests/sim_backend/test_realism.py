@@ -25,7 +25,7 @@ from sim_backend.sensors import (
     Snapshot,
     hover_thrust,
 )
-from tests.sim_backend.flying import PIPE, RADIUS
+from tests.sim_backend.flying import PIPE
 
 Array = NDArray[np.float64]
 TICK = 0.004
@@ -132,7 +132,7 @@ def test_the_bias_drifts_slowly(vehicle: Vehicle) -> None:
 
 def spun(vehicle: Vehicle, thrusts: tuple[float, ...], count: int) -> list[Snapshot]:
     """A vehicle whose rotors turn in the world's own kernel, looked at every tick."""
-    p = constants(vehicle, PlantParams(), PIPE, 0.0, RADIUS, 2.0)
+    p = constants(vehicle, PlantParams(), PIPE)
     x, u = np.zeros(at.STATE_SIZE), np.zeros(at.DRIVE_SIZE)
     x[at.ATTITUDE] = 1.0
     x[at.ROTOR_LIMIT] = 13.0
@@ -297,7 +297,7 @@ def test_vision_doubts_at_its_rate_for_its_time_and_then_is_noisier(vehicle: Veh
 
 
 def test_thrust_follows_with_the_lag_that_is_set(vehicle: Vehicle) -> None:
-    p = constants(vehicle, PlantParams(motor_lag=0.040), PIPE, 0.0, RADIUS, 2.0)
+    p = constants(vehicle, PlantParams(motor_lag=0.040), PIPE)
     x, u = np.zeros(at.STATE_SIZE), np.zeros(at.DRIVE_SIZE)
     x[at.ROTOR_LIMIT], u[at.U_ROTOR : at.U_ROTOR + 4] = 13.0, 5.0
     for _ in range(round(0.040 / p[at.STEP])):
@@ -309,7 +309,7 @@ def test_thrust_follows_with_the_lag_that_is_set(vehicle: Vehicle) -> None:
 def test_thrust_falls_with_the_voltage_by_the_share_that_no_map_makes_up_for(
     vehicle: Vehicle, sag: float, share: float
 ) -> None:
-    p = constants(vehicle, PlantParams(battery_sag=sag), PIPE, 0.0, RADIUS, 2.0)
+    p = constants(vehicle, PlantParams(battery_sag=sag), PIPE)
     x, u = np.zeros(at.STATE_SIZE), np.zeros(at.DRIVE_SIZE)
     x[at.ROTOR_LIMIT], u[at.U_ROTOR : at.U_ROTOR + 4] = 13.0, 5.0
     cell = vehicle.battery

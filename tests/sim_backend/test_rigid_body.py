@@ -14,7 +14,7 @@ from sim_backend import layout as at
 from sim_backend.array_plant import PlantParams
 from sim_backend.plant import Actuation
 from sim_backend.rigid_body import RigidBody
-from tests.sim_backend.flying import PIPE, RADIUS, mass_of, plant_at
+from tests.sim_backend.flying import PIPE, mass_of, plant_at
 
 Array = NDArray[np.float64]
 OFF = Actuation((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), False, (0.0, 0.0, 0.0, 0.0, 0.0), 0.0, False)
@@ -118,7 +118,7 @@ def test_drag_slows_towards_its_terminal_speed(vehicle: Vehicle) -> None:
 
 def test_a_limp_arm_touches_the_ground_before_the_skids(vehicle: Vehicle) -> None:
     """Where it hangs down, the vehicle stands on it; that is on the ground too."""
-    plant = RigidBody(vehicle, PlantParams(), PIPE, 0.0, RADIUS)
+    plant = RigidBody(vehicle, PlantParams(), PIPE)
     plant.x[at.JOINT : at.JOINT + 3] = (-1.62, 0.287, -2.356)
     for height, touches in ((0.015, True), (0.03, False)):
         plant.x[at.POSITION + 2] = vehicle.base.gear_height + height
@@ -127,7 +127,7 @@ def test_a_limp_arm_touches_the_ground_before_the_skids(vehicle: Vehicle) -> Non
 
 
 def test_starts_at_rest_on_its_skids_and_stays(vehicle: Vehicle) -> None:
-    plant = RigidBody(vehicle, PlantParams(), PIPE, 0.0, RADIUS)
+    plant = RigidBody(vehicle, PlantParams(), PIPE)
     start = plant.truth()
     assert start.t == 0.0
     assert start.on_ground
@@ -151,7 +151,7 @@ def test_starts_at_rest_on_its_skids_and_stays(vehicle: Vehicle) -> None:
 
 def test_skids_hold_a_side_force_until_friction_breaks(vehicle: Vehicle) -> None:
     def pushed(share: float) -> float:
-        plant = RigidBody(vehicle, PlantParams(), PIPE, 0.0, RADIUS)
+        plant = RigidBody(vehicle, PlantParams(), PIPE)
         # Gravity leaning along x is a horizontal push of that share of the weight.
         plant.p[at.DRAG] = 0.0
         for _ in range(500):
@@ -169,7 +169,7 @@ def test_skids_hold_a_side_force_until_friction_breaks(vehicle: Vehicle) -> None
 
 
 def test_a_limp_arm_comes_to_rest_on_the_ground(vehicle: Vehicle) -> None:
-    plant = RigidBody(vehicle, PlantParams(ideal_servos=False), PIPE, 0.0, RADIUS)
+    plant = RigidBody(vehicle, PlantParams(ideal_servos=False), PIPE)
     plant.advance(OFF, 6.0)
     truth = plant.truth()
     assert truth.crashed == ""
@@ -179,7 +179,7 @@ def test_a_limp_arm_comes_to_rest_on_the_ground(vehicle: Vehicle) -> None:
 
 def test_hard_hits_break_the_vehicle_and_soft_ones_do_not(vehicle: Vehicle) -> None:
     def dropped(height: float) -> RigidBody:
-        plant = RigidBody(vehicle, PlantParams(), PIPE, 0.0, RADIUS)
+        plant = RigidBody(vehicle, PlantParams(), PIPE)
         plant.x[at.POSITION + 2] += height
         plant.advance(
             msgspec.structs.replace(
@@ -210,8 +210,8 @@ def test_turning_over_is_a_crash(vehicle: Vehicle) -> None:
 @pytest.mark.parametrize(("height", "struck"), [(0.0, True), (0.079, True), (0.09, False), (-0.3, False)])
 def test_a_propeller_in_the_pipe_is_a_crash(vehicle: Vehicle, height: float, struck: bool) -> None:
     plant = plant_at(vehicle, PlantParams(), gap=1.0)
-    plant.x[at.POSITION] = PIPE[0] - vehicle.rotors.arm_x
-    plant.x[at.POSITION + 2] = PIPE[2] + height
+    plant.x[at.POSITION] = PIPE.position[0] - vehicle.rotors.arm_x
+    plant.x[at.POSITION + 2] = PIPE.position[2] + height
     plant.advance(OFF, 1e-4)
     assert (plant.truth().crashed != "") is struck
 

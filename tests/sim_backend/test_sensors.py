@@ -16,14 +16,14 @@ from sim_backend.sensors import (
     ServoSensorParams,
 )
 from sim_backend.world import World, WorldParams
-from tests.sim_backend.flying import PIPE, RADIUS
+from tests.sim_backend.flying import PIPE
 from tests.sim_backend.noisy import NOISY
 
 TICK = 0.004
 
 
 def world_with(vehicle: Vehicle, sensors: SensorParams, seed: int = 1) -> World:
-    return World(vehicle, WorldParams(sensors=sensors, plant=PlantParams(step=2e-4)), PIPE, 0.0, RADIUS, seed=seed)
+    return World(vehicle, WorldParams(sensors=sensors, plant=PlantParams(step=2e-4)), PIPE, seed=seed)
 
 
 def test_ideal_measurements_are_the_truth_of_now(vehicle: Vehicle) -> None:

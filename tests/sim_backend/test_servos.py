@@ -12,7 +12,7 @@ from drivers.vehicle import Vehicle
 from sim_backend import layout as at
 from sim_backend.array_plant import PlantParams, constants
 from sim_backend.servos import joint_torque, stop_torque, tool_servos
-from tests.sim_backend.flying import PIPE, RADIUS
+from tests.sim_backend.flying import PIPE
 
 Array = NDArray[np.float64]
 STALL, STALL_CURRENT, NO_LOAD = 0.93, 1.8, 8.48
@@ -22,7 +22,7 @@ class Bench:
     """One joint servo on a bench."""
 
     def __init__(self, vehicle: Vehicle, *, ideal: bool = True) -> None:
-        self.p = constants(vehicle, PlantParams(ideal_servos=ideal), PIPE, 0.0, RADIUS, 2.0)
+        self.p = constants(vehicle, PlantParams(ideal_servos=ideal), PIPE)
         self.x, self.u = np.zeros(at.STATE_SIZE), np.zeros(at.DRIVE_SIZE)
         self.u[at.U_TORQUE_ON] = 1.0
         self.u[at.U_CURRENT_LIMIT] = STALL_CURRENT
