@@ -24,7 +24,7 @@ LETTERS: Final = {
     "completed": "C", "resumed": "R", "landed": "L", "autolanded": "A", "grounded": "G", "holding": "H",
     "unfinished": "U", "lost": "X", "error": "E",
 }  # fmt: skip
-_SHOWN: Final = ("meas_des", "est_des", "est_meas", "touchdown_peak", "no_contact", "longest_gap")
+_SHOWN: Final = ("meas_des", "est_des", "est_meas", "touchdown_peak", "no_contact", "press_gap")
 _DPI: Final = 110
 
 

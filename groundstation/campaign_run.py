@@ -52,7 +52,8 @@ FIGURES: Final = (
     Figure("hold_mean", "N", "mean force of the hold"),
     Figure("hold_std", "N", "standard deviation of the force in the hold"),
     Figure("no_contact", "", "share of the press without contact"),
-    Figure("longest_gap", "s", "longest loss of contact until it was there again"),
+    Figure("longest_gap", "s", "longest loss of contact since the first touch"),
+    Figure("press_gap", "s", "longest loss of contact from trigger to release"),
     Figure("presses", "", "times that the press was begun"),
     Figure("tip_slip", "m", "sliding of the tip along the pipe"),
     Figure("thrust_max", "N", "largest thrust of a rotor"),
@@ -158,7 +159,7 @@ def _told(run: Run, figures: dict[str, Any]) -> dict[str, Any]:
         **figures["force_rmse"],
         **{
             name: contact[name]
-            for name in ("touchdown_peak", "peak", "hold_mean", "hold_std", "longest_gap", "tip_slip")
+            for name in ("touchdown_peak", "peak", "hold_mean", "hold_std", "longest_gap", "press_gap", "tip_slip")
         },
         "no_contact": float(np.mean(force[pressing] <= 0.0)) if pressing.any() else None,
         "presses": float(sum(phase["name"] == Phase.PRESS for phase in figures["phases"])),
