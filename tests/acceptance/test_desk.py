@@ -15,33 +15,13 @@ import pytest
 
 from onboard.replay import replay
 from tests.acceptance.flights import Flown, completed, look, pipewright
+from tests.brisk import BRISK
 from tests.realtime import REALTIME, alone
 
 pytestmark = REALTIME
 
-#: About 65 s of flight: a near pipe, brisk motion, a light and short press.
-BRISK = (
-    "pipe.position=[1.6,0,1.2]",
-    "plan.takeoff_height=0.8",
-    "plan.standoff=0.8",
-    "plan.speed=0.8",
-    "plan.acceleration=0.8",
-    "plan.jerk=2",
-    "plan.near_speed=0.25",
-    "plan.advance_speed=0.015",
-    "plan.arm_speed=0.25",
-    "plan.needle_speed=0.1",
-    "plan.arc_max=0.6",
-    "plan.retreat=0.2",
-    "plan.descent_speed=0.3",
-    "guidance.tare_settle=1",
-    "guidance.tare_time=1",
-    "force_profile.settle=0.5",
-    "force_profile.bias_hold=0.5",
-    "force_profile.ramp=3",
-    "repair.force=1.5",
-    "repair.hold=2",
-)
+#: Just over a minute of flight.
+SETS = (*BRISK, "repair.hold=2")
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +29,7 @@ def folder() -> Iterator[Path]:
     """The run folder of ``pipewright desk``."""
     with TemporaryDirectory(prefix="pipewright-") as name:
         with alone():
-            sets = (f"--set={item}" for item in BRISK)
+            sets = (f"--set={item}" for item in SETS)
             done = pipewright("desk", "--out", "run", *sets, cwd=Path(name), timeout=300.0)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "Traceback" not in done.stderr

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from tests.acceptance.flights import COMMAND
-from tests.process.flying import BRISK, PATIENCE
+from tests.process.flying import PATIENCE, SETS
 from tests.realtime import alone
 from tests.zenoh_sessions import free_port
 
@@ -183,7 +183,7 @@ class Desk:
 def desk(folder: Path, *sets: str, config: str = "desk", tls: bool = False) -> Iterator[Desk]:
     """A desk that waits on the ground, the only one of this machine; at the end it is interrupted."""
     endpoint = f"{'tls' if tls else 'tcp'}/127.0.0.1:{free_port()}"
-    given = (*BRISK, *sets, f"link.listen=[{endpoint}]", f"link.plain={str(not tls).lower()}")
+    given = (*SETS, *sets, f"link.listen=[{endpoint}]", f"link.plain={str(not tls).lower()}")
     arguments = ["desk", "--no-autostart", f"--config={config}", "--out=runs/flight", "--no-progress"]
     with alone(), Running(*arguments, *(f"--set={item}" for item in given), cwd=folder) as running:
         found = Desk(folder, given, running, endpoint)

@@ -19,6 +19,7 @@ from groundstation.desk import Desk, end, start
 from onboard.core.types import Phase
 from sim_backend.world_client import WorldClient
 from sim_backend.world_messages import Look
+from tests.brisk import BRISK
 from tests.realtime import alone
 
 #: Whatever is waited for comes well before this, s: the machine may be busy.
@@ -27,30 +28,8 @@ PATIENCE = 60.0
 TAKEOFFS = 3
 #: A takeoff that was refused is asked for again after this time, s.
 _AGAIN = 3.0
-#: A brisk flight: takes off to 0.8 m and presses about 25 s later.
-BRISK = (
-    "pipe.position=[1.6,0,1.2]",
-    "plan.takeoff_height=0.8",
-    "plan.standoff=0.8",
-    "plan.gap=0.03",
-    "plan.speed=0.8",
-    "plan.acceleration=0.8",
-    "plan.jerk=2",
-    "plan.near_speed=0.25",
-    "plan.advance_speed=0.015",
-    "plan.arm_speed=0.25",
-    "plan.needle_speed=0.1",
-    "plan.arc_max=0.6",
-    "plan.retreat=0.2",
-    "plan.descent_speed=0.3",
-    "guidance.tare_settle=1",
-    "guidance.tare_time=1",
-    "force_profile.settle=0.5",
-    "force_profile.bias_hold=0.5",
-    "force_profile.ramp=3",
-    "repair.force=1.5",
-    "repair.hold=20",
-)
+#: Settings of the flight; it presses for long.
+SETS = (*BRISK, "repair.hold=20")
 
 #: The flight process, but for one thing: on SIGUSR1 the thread of the loop spins for ever.
 _STICKY = """
@@ -78,7 +57,7 @@ class Flying:
         """``arguments`` are for the flight process alone."""
         self.folder = folder
         self._arguments = arguments
-        self._common = [f"--config={config}", *(f"--set={item}" for item in (*BRISK, *sets))]
+        self._common = [f"--config={config}", *(f"--set={item}" for item in (*SETS, *sets))]
         self.looks: list[Look] = []
         self.lines: list[Line] = []
         self._ended = False
