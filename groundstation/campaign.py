@@ -178,6 +178,14 @@ def _say(summary: Summary, folder: Path, console: Any) -> None:
         f"lost {100 * lost.share:.1f} % (up to {100 * lost.high:.1f} %); {summary.speed:.1f} x real time per core",
         soft_wrap=True,
     )
+    if summary.estimators:
+        console.print(side_by_side(summary))
+    if summary.watched_s:
+        console.print(
+            f"False contacts: {summary.false_contacts}, in {summary.watched_s:.0f} s with the trigger watched "
+            "and nothing touching",
+            soft_wrap=True,
+        )
     for verdict in summary.verdicts:
         mark = "[green]✓[/]" if verdict.met else "[red]✗[/]"
         value = "not known" if verdict.value is None else f"{verdict.value:.3f}"
@@ -188,6 +196,21 @@ def _say(summary: Summary, folder: Path, console: Any) -> None:
             console.print(f"[red]✗[/] {cell.fault} at {cell.moment}: {', '.join(cell.ends)}", soft_wrap=True)
             console.print(f"    {cell.command}", soft_wrap=True, markup=False)
     console.print(f"\nreport: {folder / 'report.html'}", soft_wrap=True)
+
+
+def side_by_side(summary: Summary) -> Any:
+    """The table of the force estimators; it fits a terminal of 80 columns."""
+    from groundstation import campaign_report
+    from groundstation.terminal import ruled
+
+    headings, rows = campaign_report.side_by_side(summary)
+    table = ruled("Force estimators, medians", gap=0)
+    table.add_column("")
+    for heading in headings:
+        table.add_column(heading.replace(", ", ",\n"), justify="right")
+    for label, cells in rows:
+        table.add_row(label, *cells)
+    return table
 
 
 def _code(summary: Summary) -> int:

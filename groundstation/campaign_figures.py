@@ -24,7 +24,7 @@ LETTERS: Final = {
     "completed": "C", "resumed": "R", "landed": "L", "autolanded": "A", "grounded": "G", "holding": "H",
     "unfinished": "U", "lost": "X", "error": "E",
 }  # fmt: skip
-_SHOWN: Final = ("meas_des", "est_des", "est_meas", "touchdown_peak", "no_contact", "longest_gap")
+_SHOWN: Final = ("meas_des", "est_des", "est_meas", "touchdown_peak", "no_contact", "press_gap")
 _DPI: Final = 110
 
 
@@ -109,4 +109,4 @@ def _histogram(axes: Axes, summary: Summary, table: pa.Table, name: str, label: 
     axes.set_ylabel("runs", fontsize=8)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-    axes.legend(fontsize=7, frameon=False)
+    axes.legend(fontsize=7, framealpha=0.85, edgecolor="none")

@@ -12,7 +12,8 @@ import pyarrow as pa
 
 from groundstation.campaign_figures import COLOURS, LETTERS
 from groundstation.campaign_run import ENDS, FIGURES
-from groundstation.campaign_summary import Rate, Summary, column
+from groundstation.campaign_summary import Rate, Side, Summary, column
+from groundstation.estimators import LABELS
 from groundstation.svg import Chart
 
 _HERE = Path(__file__).parent
@@ -45,6 +46,7 @@ def _page(summary: Summary, table: pa.Table) -> Iterator[str]:
     yield from _ends(summary)
     yield from _matrix(summary)
     yield from _verdicts(summary)
+    yield from _estimators(summary)
     yield from _distributions(summary, table)
     yield from _sensitivities(summary)
     yield from _worst(summary)
@@ -69,23 +71,21 @@ def _about(summary: Summary) -> str:
     return f"Scenario {campaign.scenario}{law}{sets}; {summary.runs} of {summary.planned} runs; {hours}."
 
 
-def _percent(rate: Rate) -> str:
-    return f"{100 * rate.share:.1f} % ({100 * rate.low:.1f} to {100 * rate.high:.1f} %)"
-
-
 def _cards(summary: Summary) -> Iterator[str]:
     yield '<div class="cards">'
-    yield _card(_percent(summary.success), f"completed: {summary.success.count} of {summary.success.of}, 95 % interval")
-    lost = summary.lost
-    yield _card(
-        _percent(lost), f"vehicle lost: {lost.count} of {lost.of}, 95 % interval", "bad" if lost.count else "good"
-    )
+    yield _share("completed", summary.success)
+    yield _share("vehicle lost", summary.lost, "bad" if summary.lost.count else "good")
     for name in ("meas_des", "est_meas", "touchdown_peak"):
         if name in summary.figures:
             figure, spread = next(f for f in FIGURES if f.name == name), summary.figures[name]
             yield _card(f"{spread.median:.3f} / {spread.p95:.3f} {figure.unit}", f"{figure.words}: median / 95 %")
     yield _card(f"{summary.speed:.1f} x", "real time, per core")
     yield "</div>"
+
+
+def _share(label: str, rate: Rate, kind: str = "") -> str:
+    interval = f"{100 * rate.low:.1f} to {100 * rate.high:.1f} % with 95 % confidence"
+    return _card(f"{100 * rate.share:.1f} %", f"{label}: {rate.count} of {rate.of}, {interval}", kind)
 
 
 def _card(value: str, label: str, kind: str = "") -> str:
@@ -153,11 +153,57 @@ def _verdicts(summary: Summary) -> Iterator[str]:
     yield "</table>"
 
 
+def _estimators(summary: Summary) -> Iterator[str]:
+    if not summary.estimators:
+        return
+    yield '<h2>Force estimators, in the same runs</h2><p class="note">'
+    if any(side.runs for side in summary.estimators):
+        yield "Medians over the runs, from trigger to release against the true compression; the ratio is the paper's "
+        yield "RMSE by its own in the same run, with the interval that holds its median with 95 % confidence. "
+    if summary.watched_s:
+        yield f"The trigger was watched for {summary.watched_s:.0f} s with nothing touching, false contacts: "
+        yield f"{summary.false_contacts}; the last two columns say what each read meanwhile (RMS of all that time), "
+        yield "and how often it alone would have pulled the trigger."
+    headings, rows = side_by_side(summary)
+    yield '</p><div class="scroll"><table><tr><th>estimator</th>'
+    yield "".join(f'<th class="n">{heading}</th>' for heading in headings) + "</tr>"
+    for label, cells in rows:
+        yield f"<tr><td>{escape(label)}</td>" + "".join(f'<td class="n">{cell}</td>' for cell in cells) + "</tr>"
+    yield "</table></div>"
+
+
+def side_by_side(summary: Summary) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Headings, and label and cells of each estimator; without the columns that no run tells anything of."""
+    columns: dict[str, list[str]] = {
+        "runs": [str(side.runs or "") for side in summary.estimators],
+        "RMSE, N": [_cell(side.rmse, ".3f") for side in summary.estimators],
+        "bias, N": [_cell(side.bias, "+.3f") for side in summary.estimators],
+        "delay, ms": [_cell(side.delay, ".0f", 1000.0) for side in summary.estimators],
+        "paper by own": [_ratio(side) for side in summary.estimators],
+        "watched, N": [_cell(side.watched_rms, ".3f") for side in summary.estimators],
+        "pulls": [str(side.pulls) if side.watched_rms is not None else "" for side in summary.estimators],
+    }
+    told = {heading: cells for heading, cells in columns.items() if any(cells)}
+    return list(told), [
+        (LABELS[side.name], [cells[i] for cells in told.values()]) for i, side in enumerate(summary.estimators)
+    ]
+
+
+def _cell(value: float | None, form: str, factor: float = 1.0) -> str:
+    return "" if value is None else f"{factor * value:{form}}"
+
+
+def _ratio(side: Side) -> str:
+    if side.ratio_low is None or side.name == "paper":
+        return _cell(side.ratio, ".2f")
+    return f"{side.ratio:.2f} ({side.ratio_low:.2f} to {side.ratio_high:.2f})"
+
+
 def _distributions(summary: Summary, table: pa.Table) -> Iterator[str]:
     yield '<h2>Distributions</h2><div class="pair">'
     for figure in FIGURES:
         spread = summary.figures.get(figure.name)
-        if spread is None or spread.high - spread.low < 1e-9 * max(1.0, abs(spread.high)):
+        if not figure.charted or spread is None or spread.high - spread.low < 1e-9 * max(1.0, abs(spread.high)):
             continue
         values = column(table, figure.name)
         counts, edges = np.histogram(values[np.isfinite(values)], bins=min(_BINS, max(6, spread.count // 4)))

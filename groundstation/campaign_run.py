@@ -15,11 +15,12 @@ from msgspec import Struct
 
 from groundstation import metrics
 from groundstation.campaign_file import Job
-from groundstation.run import Gathering, Run
+from groundstation.estimators import LABELS
+from groundstation.run import ESTIMATORS, FELT, Gathering, Run
 from onboard.headless import ConfigError, InfeasibleError, Mission
 from onboard.messages import PARAMS, Phase
 
-#: What is kept of one process flies one mission at a time, however many threads it has.
+#: One process flies one mission at a time, however many threads it has.
 _ALONE: Final = threading.Lock()
 _AIRBORNE: Final = tuple(phase for phase in Phase if phase not in (Phase.PREFLIGHT, Phase.ARMED, Phase.STOPPED))
 
@@ -30,8 +31,18 @@ class Figure(Struct, frozen=True):
     name: str
     unit: str
     words: str
+    charted: bool = True
+    """The report shows its distribution."""
 
 
+#: What is kept of each force estimator: key in ``metrics.json``, unit, words.
+OF_ESTIMATORS: Final = (
+    ("rmse", "N", "RMSE in contact"),
+    ("bias", "N", "bias in contact"),
+    ("delay", "s", "delay in contact"),
+    ("watched_rms", "N", "RMS with the trigger watched and nothing touching"),
+    ("pulls", "", "times it alone would then have pulled the trigger"),
+)
 FIGURES: Final = (
     Figure("meas_des", "N", "measured less desired force in contact, RMSE"),
     Figure("est_des", "N", "estimated less desired force in contact, RMSE"),
@@ -41,7 +52,8 @@ FIGURES: Final = (
     Figure("hold_mean", "N", "mean force of the hold"),
     Figure("hold_std", "N", "standard deviation of the force in the hold"),
     Figure("no_contact", "", "share of the press without contact"),
-    Figure("longest_gap", "s", "longest loss of contact until it was there again"),
+    Figure("longest_gap", "s", "longest loss of contact since the first touch"),
+    Figure("press_gap", "s", "longest loss of contact from trigger to release"),
     Figure("presses", "", "times that the press was begun"),
     Figure("tip_slip", "m", "sliding of the tip along the pipe"),
     Figure("thrust_max", "N", "largest thrust of a rotor"),
@@ -49,6 +61,13 @@ FIGURES: Final = (
     Figure("path_error_rms", "m", "needle off its path, RMS"),
     Figure("estimator_gain", "", "the paper's estimator's RMSE by that of the selected one"),
     Figure("false_contacts", "", "contacts that the trigger saw and were none"),
+    Figure("alarms", "", "contacts that it would have seen in free flight, had the tip been at the crack"),
+    Figure("watched_s", "s", "time that the trigger was watched, nothing touching"),
+    *(
+        Figure(f"{name}_{key}", unit, f"{LABELS[name]}: {words}", charted=False)
+        for name in (*ESTIMATORS, FELT)
+        for key, unit, words in OF_ESTIMATORS
+    ),
     Figure("sim_s", "s", "simulated time"),
     Figure("wall_s", "s", "time it took"),
     Figure("speed", "", "times real time"),
@@ -140,7 +159,7 @@ def _told(run: Run, figures: dict[str, Any]) -> dict[str, Any]:
         **figures["force_rmse"],
         **{
             name: contact[name]
-            for name in ("touchdown_peak", "peak", "hold_mean", "hold_std", "longest_gap", "tip_slip")
+            for name in ("touchdown_peak", "peak", "hold_mean", "hold_std", "longest_gap", "press_gap", "tip_slip")
         },
         "no_contact": float(np.mean(force[pressing] <= 0.0)) if pressing.any() else None,
         "presses": float(sum(phase["name"] == Phase.PRESS for phase in figures["phases"])),
@@ -148,7 +167,12 @@ def _told(run: Run, figures: dict[str, Any]) -> dict[str, Any]:
         "torque_max": limits["torque_max"],
         "path_error_rms": figures["adhesive"]["path_error_rms"],
         "estimator_gain": estimators.get("ratio"),
-        "false_contacts": estimators.get("false_contacts"),
+        **{name: estimators.get(name) for name in ("false_contacts", "alarms", "watched_s")},
+        **{
+            f"{name}_{key}": row[key]
+            for name, row in estimators.get("table", {}).items()
+            for key, _, _ in OF_ESTIMATORS
+        },
         "sim_s": figures["sim_s"],
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,7 +15,8 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from groundstation.campaign_file import Campaign, Limit, Plan
-from groundstation.campaign_run import ENDS, NAMES, SUCCESS
+from groundstation.campaign_run import ENDS, NAMES, OF_ESTIMATORS, SUCCESS
+from groundstation.run import ESTIMATORS, FELT
 
 Array = NDArray[np.float64]
 
@@ -47,6 +49,28 @@ class Distribution(Struct, frozen=True):
     median: float
     p95: float
     high: float
+
+
+class Side(Struct, frozen=True):
+    """One force estimator over the runs: medians of its figures, and of the paper's RMSE by its own in the same run.
+
+    The ratio's interval holds the true median with 95 % confidence, whatever the distribution (by order statistics);
+    it takes six runs. N, s.
+    """
+
+    name: str
+    runs: int
+    """With a contact."""
+    rmse: float | None
+    bias: float | None
+    delay: float | None
+    ratio: float | None
+    ratio_low: float | None
+    ratio_high: float | None
+    watched_rms: float | None
+    """While the trigger was watched with nothing touching; root of the mean square over all of that time."""
+    pulls: int
+    """How often, in all runs, it alone would then have pulled the trigger."""
 
 
 class Verdict(Struct, frozen=True):
@@ -108,6 +132,11 @@ class Summary(Struct, frozen=True):
     sensitivities: tuple[Sensitivity, ...]
     worst: tuple[Worst, ...]
     cells: tuple[Cell, ...]
+    estimators: tuple[Side, ...]
+    watched_s: float
+    """With the gate of the trigger open and nothing touching, of all runs."""
+    false_contacts: int
+    """In all runs."""
     simulated_s: float
     wall_s: float
     speed: float
@@ -138,6 +167,9 @@ def summarize(plan: Plan, table: pa.Table) -> Summary:
         sensitivities=tuple(_sensitivities(plan, table)),
         worst=tuple(_worst(plan, table)),
         cells=tuple(_cells(plan, table)),
+        estimators=tuple(_sides(table)),
+        watched_s=float(np.nansum(column(table, "watched_s"))),
+        false_contacts=int(np.nansum(column(table, "false_contacts"))),
         simulated_s=simulated,
         wall_s=wall,
         speed=simulated / wall if wall else 0.0,
@@ -172,6 +204,45 @@ def distribution(values: Array) -> Distribution | None:
         return None
     low, p5, median, p95, high = (float(value) for value in np.quantile(known, _QUANTILES))
     return Distribution(int(known.size), float(known.mean()), low, p5, median, p95, high)
+
+
+def median_interval(values: Array) -> tuple[float, float] | None:
+    """Where the median of what they are drawn from lies with 95 % confidence; None when they are too few to tell."""
+    from scipy.stats import binom
+
+    k = int(binom.ppf(0.5 * (1.0 - _CONFIDENCE), len(values), 0.5)) if len(values) else 0
+    ordered = np.sort(values)
+    return (float(ordered[k - 1]), float(ordered[-k])) if k else None
+
+
+def _sides(table: pa.Table) -> Iterator[Side]:
+    paper, watched = column(table, "paper_rmse"), column(table, "watched_s")
+    for name in (*ESTIMATORS, FELT):
+        of = {key: column(table, f"{name}_{key}") for key, _, _ in OF_ESTIMATORS}
+        read = np.isfinite(of["watched_rms"])
+        if not (read | np.isfinite(of["rmse"])).any():
+            continue
+        ratios = paper / np.where(of["rmse"] > 0.0, of["rmse"], np.nan)
+        ratios = ratios[np.isfinite(ratios)]
+        low, high = median_interval(ratios) or (None, None)
+        time = float(watched[read].sum())
+        yield Side(
+            name=name,
+            runs=int(np.isfinite(of["rmse"]).sum()),
+            rmse=_median(of["rmse"]),
+            bias=_median(of["bias"]),
+            delay=_median(of["delay"]),
+            ratio=_median(ratios),
+            ratio_low=low,
+            ratio_high=high,
+            watched_rms=float(np.sqrt(np.sum(of["watched_rms"][read] ** 2 * watched[read]) / time)) if time else None,
+            pulls=int(np.nansum(of["pulls"])),
+        )
+
+
+def _median(values: Array) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else None
 
 
 def _verdict(limit: Limit, values: Array) -> Verdict:

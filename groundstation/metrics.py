@@ -200,7 +200,7 @@ def _contact(run: Run, window: Windows) -> dict[str, Any]:
     hold = pressed[(run.force_des[span] >= 0.999 * wanted) & np.isfinite(pressed)]
     reached = np.flatnonzero(pressed >= 0.95 * wanted)
     touched = window.touch.stop > window.touch.start
-    gaps = _gaps(~(truth.force[window.touch] <= 0.0), run.t[window.touch]) if truth is not None else []
+    gaps, press_gaps = (_gaps(run, of) for of in (window.touch, span))
     return {
         "source": "truth" if truth is not None else "estimate",
         "peak": _largest(peak[: span.stop]) if touched else None,
@@ -214,6 +214,7 @@ def _contact(run: Run, window: Windows) -> dict[str, Any]:
         else None,
         "bounces": len(gaps) if truth is not None and touched else None,
         "longest_gap": max(gaps, default=0.0) if truth is not None and touched else None,
+        "press_gap": max(press_gaps, default=0.0) if truth is not None and pressed.size else None,
         "time_without_contact": float(sum(gaps)) if truth is not None and touched else None,
     }
 
@@ -231,8 +232,11 @@ def _settled(run: Run, window: Windows) -> int:
     return start + int(rising[0]) if rising.size else int(window.contact.stop)
 
 
-def _gaps(touching: Mask, t: Array) -> list[float]:
-    """Durations (s) of the losses of contact longer than ``BOUNCE_GAP``."""
+def _gaps(run: Run, span: slice) -> list[float]:
+    """Durations (s) of the losses of contact longer than ``BOUNCE_GAP``; none where the truth is not known."""
+    if run.truth is None:
+        return []
+    touching, t = ~(run.truth.force[span] <= 0.0), run.t[span]
     edges = np.flatnonzero(np.diff(np.concatenate(([True], touching, [True])).astype(np.int8)))
     period = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     lengths = (edges[1::2] - edges[::2]) * period

@@ -175,6 +175,11 @@ class _Estimators(Struct, frozen=True):
     selected: str = "paper"
 
 
+class _Contact(Struct, frozen=True):
+    threshold: float = 0.15
+    debounce: float = 0.10
+
+
 class RunConfig(Struct):
     """The parameters that figures of merit are measured against."""
 
@@ -184,6 +189,7 @@ class RunConfig(Struct):
     vehicle: _Vehicle
     world: _World = _World()
     estimators: _Estimators = _Estimators()
+    contact: _Contact = _Contact()
 
 
 class _Revision(Struct):

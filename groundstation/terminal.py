@@ -33,13 +33,7 @@ def summarize(
     console.print(f"{_WORDS[metrics['outcome']]}, {metrics['sim_s']:.1f} s{speed}")
     if metrics["outcome"] != "completed":
         _reasons(run, console)
-    side = Table(
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-        title="RMSE, beside Table II of the paper",
-        title_justify="left",
-    )
+    side = ruled("RMSE, beside Table II of the paper")
     for heading in ("", "paper", "this run", "in contact", "unit", "verdict"):
         side.add_column(heading, justify="right" if heading in ("paper", "this run", "in contact") else "left")
     for other in beside:
@@ -64,15 +58,14 @@ def summarize(
     console.print(f"\nreport: {report}", soft_wrap=True, highlight=False)
 
 
+def ruled(title: str, gap: int = 1) -> Table:
+    """An empty table with a rule under its headings; between its columns are a space and ``gap`` more."""
+    return Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), title=title, title_justify="left")
+
+
 def side_by_side(told: dict[str, Any]) -> Table:
     """The table of the force estimators."""
-    side = Table(
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-        title="Force estimators, from trigger to release",
-        title_justify="left",
-    )
+    side = ruled("Force estimators, from trigger to release")
     side.add_column("")
     for heading in estimators.HEADINGS:
         side.add_column(heading, justify="right")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import shlex
@@ -19,9 +20,11 @@ import psutil
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from rich.console import Console
 from scipy.stats import binomtest
 
 from groundstation import (
+    campaign,
     campaign_figures,
     campaign_pool,
     campaign_report,
@@ -75,7 +78,7 @@ def read(given: str) -> Plan:
 @pytest.mark.parametrize("name", SHIPPED.names())
 def test_what_is_shipped_can_be_flown(name: str) -> None:
     plan = read(name)
-    assert len(plan) == {"realistic": 100, "robustness": 500}.get(name, len(plan))
+    assert len(plan) == {"realistic": 100, "robustness": 500, "gusts": 6}.get(name, len(plan))
     assert plan.campaign.scenario in scenario_names()
 
 
@@ -375,6 +378,52 @@ def test_the_summary_counts_measures_and_finds_the_worst(tmp_path: Path) -> None
     assert re.search(r'<svg class="chart".*measured less desired force', html)
     campaign_figures.distributions(summary, store.table(), tmp_path / "picture.png")
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_estimators_are_told_side_by_side(tmp_path: Path) -> None:
+    plan = plan_of(9)
+    rows = rows_of(plan, watched_s=100.0, false_contacts=0.0)
+    for k, row in enumerate(rows):
+        row |= {"paper_rmse": 0.2 + 0.01 * k, "kalman_rmse": 0.1, "kalman_bias": -0.02, "kalman_delay": 0.05}
+        row |= {"kalman_watched_rms": 0.03 + 0.01 * (k % 2), "kalman_pulls": float(k == 3), "paper_pulls": 4.0}
+    rows[8] |= {"kalman_rmse": None, "kalman_bias": None, "kalman_delay": None, "watched_s": 0.0, "false_contacts": 1.0}
+    store = Store(tmp_path, plan)
+    opened(store, resume=False)
+    for row in rows:
+        store.put(row)
+    summary = campaign_summary.summarize(plan, store.table())
+    assert (summary.watched_s, summary.false_contacts) == (800.0, 1)
+    paper, kalman = summary.estimators
+    assert (paper.name, paper.runs, paper.ratio, paper.watched_rms) == ("paper", 9, 1.0, None)
+    assert (kalman.name, kalman.runs, kalman.rmse, kalman.bias, kalman.delay) == ("kalman", 8, 0.1, -0.02, 0.05)
+    assert kalman.ratio == pytest.approx(2.35)
+    assert [kalman.ratio_low, kalman.ratio_high] == pytest.approx([2.0, 2.7]), "of eight: all of them"
+    assert kalman.watched_rms == pytest.approx(np.sqrt(0.5 * (0.03**2 + 0.04**2)))
+    assert kalman.pulls == 1
+    page = tmp_path / "report.html"
+    campaign_report.write(summary, store.table(), page)
+    for words in (
+        "2.35 (2.00 to 2.70)",
+        "watched for 800 s with nothing touching, false contacts: 1;",
+        "Kalman, wind apart",
+    ):
+        assert words in page.read_text()
+    printed = io.StringIO()
+    Console(width=80, file=printed).print(campaign.side_by_side(summary))
+    one_line = r"Kalman, wind apart +8 0\.100 -0\.020 +50 2\.35 \(2\.00 to 2\.70\) +0\.035 +1 *$"
+    assert re.search(one_line, printed.getvalue(), re.MULTILINE)
+    assert campaign_summary.summarize(plan_of(3), store.table().slice(0, 3)).estimators[1].ratio_low is None
+
+
+def test_the_interval_of_a_median_holds_it_as_often_as_it_says() -> None:
+    random = np.random.default_rng(7)
+    for n in (6, 10, 25):
+        intervals = [campaign_summary.median_interval(random.exponential(size=n)) for _ in range(2000)]
+        held = np.mean([low <= np.log(2.0) <= high for low, high in filter(None, intervals)])
+        assert len(list(filter(None, intervals))) == 2000
+        assert 0.94 < held < 0.99
+    assert campaign_summary.median_interval(np.arange(5.0)) is None
+    assert campaign_summary.median_interval(np.array([])) is None
 
 
 def test_the_matrix_shows_which_cell_ended_wrong(tmp_path: Path) -> None:

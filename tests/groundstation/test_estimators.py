@@ -89,6 +89,27 @@ def test_alarms_in_free_flight_are_counted(tmp_path: Path) -> None:
     assert changed(tmp_path, alarmed)["alarms"] == 2
 
 
+def test_what_is_read_with_the_gate_open_and_nothing_touching(tmp_path: Path) -> None:
+    """Twice long enough for the trigger, once too short, once while a contact fades: two pulls."""
+
+    def gusty(tick: Tick) -> Tick:
+        phase, time, estimate = tick.outputs.phase, tick.outputs.phase_time, tick.outputs.estimate
+        blown = (phase is Phase.APPROACH and (0.1 <= time < 0.3 or 0.35 <= time < 0.4)) or (
+            phase is Phase.ADVANCE and 0.1 <= time < 0.3
+        )
+        if not blown and phase is not Phase.RETURN:
+            return tick
+        forces = replace(estimate.forces, kalman=replace(estimate.forces.kalman, contact=0.2))
+        return change_outputs(tick, estimate=replace(estimate, forces=forces))
+
+    told = changed(tmp_path, gusty)
+    assert told["watched_s"] == pytest.approx(0.45, abs=0.01)
+    assert told["table"]["kalman"]["watched_rms"] == pytest.approx(0.2)
+    assert told["table"]["kalman"]["pulls"] == 2
+    assert (told["table"]["paper"]["watched_rms"], told["table"]["paper"]["pulls"]) == (pytest.approx(0.0), 0)
+    assert "With the gate open and nothing touching: 0 s." in estimators.words(told)
+
+
 def test_without_a_truth_only_the_costs_are_known(tmp_path: Path) -> None:
     log = record(tmp_path / "log.mcap", truth=False)
     (tmp_path / "costs.json").write_bytes(
@@ -98,6 +119,7 @@ def test_without_a_truth_only_the_costs_are_known(tmp_path: Path) -> None:
     assert told["cost_all"] == 8.0
     assert told["table"]["paper"] == {
         "rmse": None, "bias": None, "spread": None, "delay": None, "free_rms": pytest.approx(0.0), "cost": 2.0,
+        "watched_rms": None, "pulls": None,
     }  # fmt: skip
     assert told["false_contacts"] is None
 

@@ -103,7 +103,8 @@ def test_bounces_are_gaps_longer_than_ten_milliseconds(tmp_path: Path, gap: int,
         cycles[i] = (cycles[i][0], replace(cycles[i][1], contact_force=0.0))
     contact = changed(tmp_path, cycles)["contact"]
     assert contact["bounces"] == bounces
-    assert contact["time_without_contact"] == pytest.approx(gap * 0.004 if bounces else 0.0)
+    expected = pytest.approx(gap * 0.004 if bounces else 0.0)
+    assert contact["time_without_contact"] == contact["longest_gap"] == contact["press_gap"] == expected
 
 
 def test_bounce_before_the_trigger_counts(tmp_path: Path) -> None:
@@ -112,6 +113,7 @@ def test_bounce_before_the_trigger_counts(tmp_path: Path) -> None:
     cycles[touch] = (cycles[touch][0], replace(cycles[touch][1], contact_force=0.5, contact_peak=3.5))
     contact = changed(tmp_path, cycles)["contact"]
     assert contact["bounces"] == 1
+    assert (contact["longest_gap"], contact["press_gap"]) == (pytest.approx(0.036), 0.0), "not lost once it was found"
     assert contact["peak"] == contact["touchdown_peak"] == 3.5
 
 
