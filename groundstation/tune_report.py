@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from groundstation.tune_file import Study
 from onboard.headless import Mission, overlay_text
@@ -132,13 +134,21 @@ def _history(study: Study, search: Any, path: Path) -> None:
     axes = figure.subplots()
     axes.plot(numbers, values, "o", markersize=4, color="#0067a5", label="trial")
     axes.step(numbers, np.minimum.accumulate(values), where="post", color="#c8500a", label="best so far")
-    if min(values) > 0.0 and max(values) > 20.0 * min(values):
-        axes.set_yscale("log")
+    _scale(axes, values)
     axes.set_xlabel("trial")
     axes.set_ylabel("objective")
     axes.set_title(f"{study.name}: objective of each trial", fontsize=10)
     axes.legend(frameon=False)
     figure.savefig(path, dpi=_DPI)
+
+
+def _scale(axes: Axes, values: list[float]) -> None:
+    """Trials with penalties must not press all others together."""
+    if min(values) > 0.0 and max(values) > 20.0 * min(values):
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_locator(NullLocator())
 
 
 def _bars(importance: dict[str, float], path: Path) -> None:
@@ -155,14 +165,15 @@ def _slices(study: Study, search: Any, names: list[str], path: Path) -> None:
     rows = -(-len(names) // 3)
     figure = Figure(figsize=(9.5, 0.3 + 2.4 * rows), layout="constrained")
     places = figure.subplots(rows, min(3, len(names)), squeeze=False).ravel()
-    ceiling = float(np.quantile([trial.value for trial in complete], 0.9))
+    values = [trial.value for trial in complete]
     for axes, name in zip(places, names, strict=False):
         known = [trial for trial in complete if name in trial.params]
         given = [trial.params[name] for trial in known]
-        axes.scatter(given, [min(trial.value, ceiling) for trial in known], s=14, color="#0067a5")
+        axes.scatter(given, [trial.value for trial in known], s=14, color="#0067a5")
         axes.axvline(search.best_trial.params[name], color="#c8500a", linewidth=1.0)
         if next(item.log for item in study.tuning.parameters if item.name == name):
             axes.set_xscale("log")
+        _scale(axes, values)
         axes.set_title(name, fontsize=8)
         axes.tick_params(labelsize=7)
     for axes in places[len(names) :]:
