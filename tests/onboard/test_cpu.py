@@ -82,7 +82,7 @@ def test_the_one_that_works_has_the_share() -> None:
     meter.stop()
     for found in (latest, mean):
         assert found["dynamixel"] == max(found.values())
-        assert 0.05 < found["dynamixel"] < 1.2
+        assert 0.02 < found["dynamixel"] < 2.0, "of one core; a busy machine reads clock and time apart"
 
 
 def test_what_is_started_inside_bears_the_name_and_the_caller_has_its_own_again() -> None:
