@@ -77,7 +77,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
             "s", 0.0, 10.0, "contact lost in the press: looked for at once and for so long; 0: never", in_flight=False
         ),
     ] = 0.0
-    seek_speed: Annotated[float, spec("m/s", 0.002, 0.1, "speed with which it is looked for")] = 0.02
+    seek_speed: Annotated[float, spec("m/s", 0.002, 0.1, "speed with which it is looked for")] = 0.03
     stop_acceleration: Annotated[float, spec("m/s^2", 0.1, 3.0, "mean deceleration of a broken-off motion")] = 0.5
 
 
