@@ -81,7 +81,7 @@ def _flight(f: Flight, name: str) -> list[str]:
         _line(
             f"world, a tick of {f.steps_per_tick} steps",
             f.world,
-            share(f.world_s) + f"{f.steps_per_s / 1e3:.4g} k steps/s, {f.speed:.3g} x real time",
+            share(f.world_s) + f"{f.steps_per_s / 1e3:.0f} k steps/s, {f.speed:.3g} x real time",
         )
     )
     lines.append(
