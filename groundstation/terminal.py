@@ -66,9 +66,9 @@ def ruled(title: str, gap: int = 1) -> Table:
 def side_by_side(told: dict[str, Any]) -> Table:
     """The table of the force estimators."""
     side = ruled("Force estimators, from trigger to release")
-    side.add_column("")
+    side.add_column("", no_wrap=True)
     for heading in estimators.HEADINGS:
-        side.add_column(heading, justify="right")
+        side.add_column(heading.replace(", ", ",\n"), justify="right")
     for label, cells in estimators.rows(told):
         side.add_row(label, *cells)
     return side
