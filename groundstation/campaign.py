@@ -201,16 +201,9 @@ def _say(summary: Summary, folder: Path, console: Any) -> None:
 def side_by_side(summary: Summary) -> Any:
     """The table of the force estimators; it fits a terminal of 80 columns."""
     from groundstation import campaign_report
-    from groundstation.terminal import ruled
+    from groundstation.terminal import labelled
 
-    headings, rows = campaign_report.side_by_side(summary)
-    table = ruled("Force estimators, medians", gap=0)
-    table.add_column("")
-    for heading in headings:
-        table.add_column(heading.replace(", ", ",\n"), justify="right")
-    for label, cells in rows:
-        table.add_row(label, *cells)
-    return table
+    return labelled("Force estimators, medians", *campaign_report.side_by_side(summary), gap=0)
 
 
 def _code(summary: Summary) -> int:

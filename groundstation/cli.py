@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
@@ -295,7 +296,7 @@ def _report(options: argparse.Namespace) -> int:
 
 def _can_report() -> None:
     """What a flight's figures are told with is there; found out before it has flown."""
-    import rich.console  # noqa: F401
+    import_module("rich.console")
 
 
 def _evaluate(log: Path, *, partial: bool, begun: float | None = None, beside: Sequence[Path] = ()) -> str:

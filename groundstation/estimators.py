@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from groundstation.run import ESTIMATORS, FELT, Array, Mask, Run
+from groundstation.run import ESTIMATORS, FELT, Array, Mask, Run, stretches
 from onboard.messages import Phase
 
 #: Costs beside a log, as the flight process measured them after the flight on the machine that flew: us, by name.
@@ -109,8 +109,7 @@ def _watched(run: Run) -> Mask:
 
 def _pulls(high: Mask, run: Run, period: float) -> int:
     """How often it lasts for as long as the trigger asks."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], high, [False])).astype(np.int8)))
-    return int(np.count_nonzero((edges[1::2] - edges[::2]) * period >= run.config.contact.debounce))
+    return int(np.count_nonzero(stretches(high) * period >= run.config.contact.debounce))
 
 
 def delay(estimate: Array, truth: Array, period: float) -> float | None:

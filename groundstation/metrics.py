@@ -16,7 +16,7 @@ import numpy as np
 
 from groundstation import estimators, health
 from groundstation.punctuality import timing
-from groundstation.run import Array, Mask, Run
+from groundstation.run import Array, Mask, Run, stretches
 from onboard.messages import Phase
 
 #: Table II of the paper, as printed: N, m, deg.
@@ -236,10 +236,9 @@ def _gaps(run: Run, span: slice) -> list[float]:
     """Durations (s) of the losses of contact longer than ``BOUNCE_GAP``; none where the truth is not known."""
     if run.truth is None:
         return []
-    touching, t = ~(run.truth.force[span] <= 0.0), run.t[span]
-    edges = np.flatnonzero(np.diff(np.concatenate(([True], touching, [True])).astype(np.int8)))
+    t = run.t[span]
     period = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
-    lengths = (edges[1::2] - edges[::2]) * period
+    lengths = stretches(run.truth.force[span] <= 0.0) * period
     return [float(length) for length in lengths if length > BOUNCE_GAP]
 
 

@@ -37,6 +37,13 @@ Four = tuple[float, float, float, float]
 Five = tuple[float, float, float, float, float]
 
 
+def stretches(mask: Mask) -> NDArray[np.int64]:
+    """How many ticks each stretch has in which it holds, in order."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
+    lengths: NDArray[np.int64] = edges[1::2] - edges[::2]
+    return lengths
+
+
 # What is read of the recorded structs: the same names, only the fields that are used here.
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,11 +65,16 @@ def ruled(title: str, gap: int = 1) -> Table:
 
 def side_by_side(told: dict[str, Any]) -> Table:
     """The table of the force estimators."""
-    side = ruled("Force estimators, from trigger to release")
+    return labelled("Force estimators, from trigger to release", estimators.HEADINGS, estimators.rows(told))
+
+
+def labelled(title: str, headings: Iterable[str], rows: Iterable[tuple[str, Sequence[str]]], gap: int = 1) -> Table:
+    """A ruled table of a label and figures to a row; the unit in a heading stands under it."""
+    side = ruled(title, gap)
     side.add_column("", no_wrap=True)
-    for heading in estimators.HEADINGS:
+    for heading in headings:
         side.add_column(heading.replace(", ", ",\n"), justify="right")
-    for label, cells in estimators.rows(told):
+    for label, cells in rows:
         side.add_row(label, *cells)
     return side
 
