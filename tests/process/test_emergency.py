@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from groundstation.client import Client, StationSettings
 from groundstation.urgent import Urgent
 from onboard.core.types import Request
-from onboard.wire import Mission, Outcome, Stop
+from onboard.wire import Mission, Stop
 from tests.process.flying import flying
 from tests.realtime import REALTIME
 from tests.waiting import seconds_until
@@ -35,8 +35,8 @@ def test_a_kill_with_the_loop_stuck(tmp_path: Path) -> None:
     port = free_port()
     with flying(tmp_path, f"link.listen=[tcp/127.0.0.1:{port}]") as flight, Urgent(station(port)) as urgent:
         flight.hover()
-        # all connections are known to the vehicle, and the order that follows is the first that finds the loop stuck
-        assert urgent.ask(Mission(Request.RETREAT), timeout=PATIENCE).outcome is not Outcome.REFUSED
+        # any answer shows that the vehicle knows the connections: the order that follows is the first to find it stuck
+        urgent.ask(Mission(Request.RETREAT), timeout=PATIENCE)
         flight.signal(signal.SIGUSR1)
         before = flight.look()
         asked = time.monotonic_ns()
@@ -58,7 +58,7 @@ def test_a_stop_with_the_loop_stuck(tmp_path: Path) -> None:
         Client(replace(station(port), station="bob"), timeout=PATIENCE) as bob,
     ):
         flight.hover()
-        assert urgent.ask(Mission(Request.RETREAT), timeout=PATIENCE).outcome is not Outcome.REFUSED
+        urgent.ask(Mission(Request.RETREAT), timeout=PATIENCE)
         flight.signal(signal.SIGUSR1)
         before = flight.look()
         asked = time.monotonic_ns()
