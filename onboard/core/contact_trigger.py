@@ -30,6 +30,9 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     height: Annotated[
         float, spec("m", 0.005, 0.1, "tip above or below the crack at which it is slipping off the pipe, in the press")
     ] = 0.04
+    turn: Annotated[
+        float, spec("rad", 0.05, 1.0, "heading off the pipe's normal at which it swings about the tip, in the press")
+    ] = 0.20
     lost_force: Annotated[float, spec("N", -1.0, 3.0, "estimated force below which contact is doubtful")] = 0.05
     lost_time: Annotated[float, spec("s", 0.0, 5.0, "how long it must stay below")] = 0.5
     short_share: Annotated[float, spec("1", 0.0, 0.9, "share of the desired force that is far too little")] = 0.4

@@ -76,6 +76,9 @@ def step(
     change = dt / own.contact_blend if own.contact_blend > 0.0 else 1.0
     contact = min(1.0, state.contact + change) if reference.pressing else max(0.0, state.contact - change)
 
+    # along the arm, not along the pipe's normal: the vehicle turns about the tip that friction holds, and a push past
+    # the tip would turn it further
+    along = (cos(rpy[2]), sin(rpy[2]))
     rp, rv, ra = reference.p, reference.v, reference.a
     translation, force, _ = backstepping.step(
         state.backstepping,
@@ -84,7 +87,7 @@ def step(
         ra,
         mass,
         mass * params.vehicle.gravity,
-        derived.site.normal,
+        along,
         contact,
         flying,
         near_pipe,
@@ -145,9 +148,8 @@ def step(
         tau[6] + adapted[3], tau[7] + adapted[4], tau[8] + adapted[5],
     )  # fmt: skip
     if own.contact_torque and reference.pressing:
-        n = derived.site.normal
         f = contact * max(0.0, reference.force)  # the pipe does not pull
-        push = model.contact_torque(q, (-f * n[0], -f * n[1], 0.0))
+        push = model.contact_torque(q, (-f * along[0], -f * along[1], 0.0))
         t3, t4, t5, t6, t7, t8 = t3 - push[3], t4 - push[4], t5 - push[5], t6 - push[6], t7 - push[7], t8 - push[8]
     torque = math3.body_torque_from_euler(rpy, (t3, t4, t5))
 

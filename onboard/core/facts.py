@@ -133,9 +133,10 @@ def for_mission(
         disarmed=not armed,
         in_contact=believed.in_contact,
         contact_lost=phase is Phase.PRESS
-        # where the tip is off the crack, pushing on would not find it, but lead past the pipe
+        # where the tip is off the crack, or the arm not across the pipe, pushing on leads past the pipe
         and (
             abs(up) > contact.height
+            or abs(math3.wrap_angle(believed.rpy[2] - site.yaw)) > contact.turn
             or (not believed.in_contact and (progress.lost or aside > contact_trigger.FAR * contact.tolerance))
         ),
         overtravel=progress.missed or (phase is Phase.ADVANCE and beyond > params.plan.overtravel),

@@ -517,7 +517,7 @@ def _feel(path: Path, site: Site, params: AllParams) -> None:
     room = plan.beside(site, site.near - p.gap + p.feel_room)
     path.to(yaw=site.yaw, arm=(p.press_reach, 0.0, 0.0)).to(base=room, slow=True)
     path.add(Leg(path.at, own.tare_settle + own.tare_time, taring=True))
-    way, n = p.feel_room + p.overtravel, site.normal
+    way, n = p.feel_room + p.feel_reach, site.normal
     leg = _uniform(path.at, (way * n[0], way * n[1], 0.0), p.feel_speed)
     path.add(replace(leg, feeling=True))
 

@@ -85,7 +85,7 @@ class Facts(Struct, frozen=True, gc=False):
     disarmed: bool
     in_contact: bool
     contact_lost: bool
-    """No contact force for the configured time while pressing."""
+    """While pressing: no force for the configured time, the tip slipping off or the vehicle swinging about it."""
     overtravel: bool = False
     """The tip is farther than where contact must have come."""
     blind: bool = False
@@ -600,8 +600,8 @@ SENTENCES: Final[Mapping[str, tuple[Severity, str]]] = MappingProxyType({
     "disarm": (_W, "Broken off on the ground: disarming."),
     "disarmed": (_E, "The autopilot has disarmed or left offboard by itself. Read its messages before the next try."),
     "stopped": (_W, "On the ground and disarmed; the mission was not completed."),
-    "press_again": (_W, "Contact lost: backing off to press again, attempt {attempt} of {max}."),
-    "press_given_up": (_E, "Contact lost too often: giving up and returning. Check the pipe and the wind."),
+    "press_again": (_W, "Contact lost, or swinging about it: backing off to press again, attempt {attempt} of {max}."),
+    "press_given_up": (_E, "Contact lost, or swinging about it, too often: giving up. Check the pipe and the wind."),
     "no_contact": (_E, "No contact where the pipe should be: giving up and returning. Check the pipe's position."),
     "return_undone": (_W, "Clear of the pipe: returning without the repair."),
     "timeout": (_E, "{phase} took too long: hovering in place. Ask to resume, retreat or land."),

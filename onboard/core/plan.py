@@ -75,6 +75,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
     )
     feel: Annotated[bool, note("before the work, find out by touch how far the pipe is", in_flight=False)] = False
     feel_room: Annotated[float, spec("m", 0.02, 0.3, "sleeve to crack where that begins", in_flight=False)] = 0.10
+    feel_reach: Annotated[float, spec("m", 0.01, 0.3, "past the crack where that is given up", in_flight=False)] = 0.12
     feel_speed: Annotated[float, spec("m/s", 0.002, 0.05, "speed with which it is felt for")] = 0.015
     descent_speed: Annotated[float, spec("m/s", 0.05, 1.0, "last part of the landing")] = 0.20
     yaw_rate: Annotated[float, spec("rad/s", 0.05, 2.0, "peak yaw rate")] = 0.5

@@ -165,9 +165,9 @@ def test_the_attitude_set_point_is_the_attitude_wanted() -> None:
 
 
 @pytest.mark.parametrize("yaw", [0.2, -0.2])
-def test_the_attitude_set_point_pushes_where_it_is_wanted_before_the_heading_is_reached(yaw: float) -> None:
-    """An autopilot leans first and turns later: the push must not turn with a heading that is still wrong."""
-    _, wanted = act(believed((0.0, 0.0, yaw)), pressing(2.0), ticks=300, near_pipe=True)
+def test_the_attitude_set_point_leans_where_it_is_wanted_before_the_heading_is_reached(yaw: float) -> None:
+    """An autopilot leans first and turns later: what it is told must not turn with a heading that is still wrong."""
+    _, wanted = act(believed((0.0, 0.0, yaw)), replace(REFERENCE, p=(AT[0] + 0.3, AT[1], AT[2])), ticks=300)
     R = math3.matrix_from_quat(wanted.q_WB)
     assert math3.euler_from_quat(wanted.q_WB)[2] == pytest.approx(REFERENCE.yaw, abs=1e-9)
     assert R[2] > 0.05
@@ -187,6 +187,14 @@ def test_the_desired_force_leans_the_vehicle_into_the_pipe() -> None:
     weight = (VEHICLE.base.mass + sum(part[0] for part in parts(True))) * GRAVITY
     assert wanted.attitude[1] == pytest.approx(atan2(push, weight), rel=0.02)
     assert wanted.thrust == pytest.approx(hypot(push, weight), rel=0.02)
+
+
+@pytest.mark.parametrize("yaw", [0.1, -0.1])
+def test_the_push_goes_along_the_arm(yaw: float) -> None:
+    """Friction holds the tip: past it, the push would turn the vehicle further from the pipe's normal."""
+    turned = believed((0.0, 0.0, yaw))
+    pushed, rest = (math3.matrix_from_quat(act(turned, pressing(f), ticks=300)[1].q_WB) for f in (2.0, 0.0))
+    assert atan2(pushed[5] - rest[5], pushed[2] - rest[2]) == pytest.approx(yaw, abs=0.01)
 
 
 def test_the_arm_pushes_with_the_torques_of_the_desired_force() -> None:

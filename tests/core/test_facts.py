@@ -14,7 +14,7 @@ from onboard.core import compensation, estimators, facts, mission, safety, tare
 from onboard.core import estimate as estimating
 from onboard.core.derived import derive
 from onboard.core.guidance import Progress
-from onboard.core.math3 import matrix_from_quat
+from onboard.core.math3 import matrix_from_quat, wrap_angle
 from onboard.core.types import Action, Estimate, LinkState, Phase, Verdict
 from tests.core.following import RESTING, Follower
 from tests.core.sampled import JOINTS, T0, autopilot, inputs, odometry, quat, servos
@@ -263,6 +263,17 @@ def test_contact_is_not_lost_while_it_is_looked_for_at_the_crack() -> None:
     ):
         believed = replace(HIGH, in_contact=touching, tip_W=tip)
         assert known(phase=Phase.PRESS, believed=believed, progress=seeking).contact_lost is lost
+
+
+@pytest.mark.parametrize("heading", [0.0, pi, -2.5])
+def test_a_press_is_over_when_the_vehicle_swings_about_the_tip(heading: float) -> None:
+    config = replace(CONFIG, pipe=replace(CONFIG.pipe, heading_deg=heading * 180.0 / pi))
+    derived = derive(config)
+    for turn, lost in ((0.0, False), (0.19, False), (-0.19, False), (0.21, True), (-0.21, True)):
+        rpy = (0.0, 0.1, wrap_angle(heading + turn))
+        believed = replace(HIGH, in_contact=True, tip_W=derived.site.crack, rpy=rpy)
+        told = facts.for_mission(SEEN, believed, Progress(), Phase.PRESS, True, WELL, None, derived, config)
+        assert told.contact_lost is lost
 
 
 def test_a_pipe_that_was_not_felt_is_overtravel() -> None:

@@ -75,7 +75,7 @@ def test_a_pipe_that_is_not_there_is_missed() -> None:
     for _ in range(round(120.0 / DT)):
         if follower.tick(Phase.ALIGN).progress.missed:
             break
-    assert ahead(follower) == pytest.approx(P.overtravel, abs=1e-6)
+    assert ahead(follower) == pytest.approx(P.feel_reach, abs=1e-6)
 
 
 def test_the_next_flight_believes_the_mission_again() -> None:

@@ -176,6 +176,15 @@ def test_a_gust_of_five_metres_a_second(pressing: Flight, towards: float) -> Non
     released(Contact(pressing), peak=20.0, lost=RECOVERED + 0.5)
 
 
+def test_a_gust_across_the_pipe(pressing: Flight) -> None:
+    """Friction holds the tip, and the vehicle swings about it: it backs off, and presses again."""
+    pressing.world.wind = Gust(pressing.world.wind, pressing.world.time, (0.0, 8.0, 0.0))  # type: ignore[assignment]
+    contact = Contact(pressing).until(Phase.TARE, within=5.0)
+    assert "press_again" in pressing.said
+    assert contact.longest < 0.1  # not for want of contact
+    released(contact, peak=8.0)
+
+
 @pytest.mark.parametrize("jump", [0.1, 0.3])
 def test_the_tracker_jumps(pressing: Flight, jump: float) -> None:
     """The position goes on where it was; the vehicle takes the force back, retreats and holds."""
