@@ -240,7 +240,9 @@ def step(
         force, pressed = _profile(press_time, state, params)
         ahead, _ = _profile(press_time + lead, state, params)
     elif phase is Phase.RELEASE and seeking < 0.0:
-        force = ahead = params.force_profile.bias
+        # as the sleeve's mass goes the tip springs off: whoever went on pressing then would strike the sleeve with it
+        held = estimate.payload or estimate.contact_force >= params.contact.lost_force
+        force = ahead = params.force_profile.bias if held else -own.pull_back
     elif easing >= 0.0:
         easing += dt
         # without contact there is no force to take back: what is left of it would push the vehicle into the pipe

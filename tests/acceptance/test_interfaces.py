@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from groundstation.metrics import PAPER
-from tests.acceptance.flights import SHORT, Hangar, completed, in_limits
+from onboard.core.types import Phase
+from tests.acceptance.flights import SHORT, Flown, Hangar, completed, in_limits
 
 
 def rate_loop(bandwidth: float) -> tuple[str, ...]:
@@ -17,6 +19,15 @@ def rate_loop(bandwidth: float) -> tuple[str, ...]:
     )
 
 
+def struck(flown: Flown) -> float:
+    """With what the tip strikes the sleeve that it has let go, N."""
+    run = flown.run
+    assert run.truth is not None
+    leaving = np.isin(run.phase, [Phase.RELEASE, Phase.RETREAT])
+    gone = run.t[leaving & ~run.payload][0]
+    return float(run.truth.force[leaving & (run.t > gone + 0.2)].max())
+
+
 @pytest.mark.parametrize(
     ("interface", "bandwidth"),
     [("attitude", 25.0), ("attitude", 40.0), ("body_rate", 25.0), ("body_rate", 30.0), ("body_rate", 40.0)],
@@ -26,6 +37,7 @@ def test_tuned_law(fly: Hangar, interface: str, bandwidth: float) -> None:
     assert completed(flown)
     # the joints of these interfaces are soft: at the first touch the tip springs off for a moment, and never again
     assert flown.metrics["contact"]["time_without_contact"] <= 0.03
+    assert struck(flown) <= 0.5
     assert flown.metrics["force_rmse"]["meas_des"] <= 0.15
     assert in_limits(flown)
 
