@@ -78,6 +78,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = 0.0
     seek_speed: Annotated[float, spec("m/s", 0.002, 0.1, "speed with which it is looked for")] = 0.03
+    astray: Annotated[float, spec("m", 0.002, 0.2, "needle off its path at which dispensing waits for the arm")] = 0.02
     stop_acceleration: Annotated[float, spec("m/s^2", 0.1, 3.0, "mean deceleration of a broken-off motion")] = 0.5
 
 
@@ -264,6 +265,9 @@ def step(
             easing = -1.0
 
     ended = state.index >= len(state.legs)
+    waiting = leg is not None and leg.pumping and _astray(state, estimate, params)
+    if waiting:
+        paused, state = True, replace(state, rate=ZERO, acceleration=ZERO)
     if not ended and not paused:
         state = _follow(state, site, params, dt)
         ended = state.index >= len(state.legs)
@@ -306,7 +310,17 @@ def step(
         state.along,
         own.seek_time <= 0.0 or seeking > own.seek_time,
     )
-    return state, _reference(state, params, acceleration, ahead, pressing), progress
+    return state, _reference(state, params, acceleration, ahead, pressing, waiting), progress
+
+
+def _astray(state: State, estimate: Estimate, params: AllParams) -> bool:
+    """The arm does not hold the needle where it is wanted, or is not heard: adhesive would land beside the crack.
+
+    Where the base is does not count: the arm cannot help it.
+    """
+    x, z, elevation = (a - b for a, b in zip(measured(estimate, 0.0, params.vehicle)[4:7], state.at[4:7], strict=True))
+    off = hypot(x, z) + params.vehicle.arm.needle * abs(elevation)
+    return off > params.guidance.astray or estimate.age_servos > params.safety.servos_late
 
 
 def _spare(before: float, estimate: Estimate, params: AllParams, dt: float) -> float:
@@ -329,7 +343,9 @@ def _taken_back(t: float, state: State, params: Params) -> float:
     return state.press_start - (state.press_start + params.pull_back) * force_profile.quintic(t / params.force_down)
 
 
-def _reference(state: State, params: AllParams, compliant: float, force_ahead: float, pressing: bool) -> Reference:
+def _reference(
+    state: State, params: AllParams, compliant: float, force_ahead: float, pressing: bool, waiting: bool = False
+) -> Reference:
     x, y, z, yaw, wx, wz, elevation, pump = state.at
     vx, vy, vz, yaw_rate, vwx, vwz, elevation_rate, _ = state.rate
     ax, ay, az, yaw_acceleration, _, _, _, _ = state.acceleration
@@ -347,7 +363,8 @@ def _reference(state: State, params: AllParams, compliant: float, force_ahead: f
         (x, y, z), (vx, vy, vz), (ax, ay, az), yaw, yaw_rate, yaw_acceleration, (wx, wz), (vwx, vwz), elevation,
         elevation_rate, pump, own.gripper_open if open_gripper else own.gripper_closed, state.lift, state.force,
         force_ahead, pressing,
-        leg is not None and leg.pumping, state.phase in AT_THE_PIPE, compliant, offset.velocity, offset.displacement,
+        leg is not None and leg.pumping and not waiting, state.phase in AT_THE_PIPE, compliant, offset.velocity,
+        offset.displacement,
     )  # fmt: skip
 
 
