@@ -78,7 +78,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = 0.0
     seek_speed: Annotated[float, spec("m/s", 0.002, 0.1, "speed with which it is looked for")] = 0.03
-    astray: Annotated[float, spec("m", 0.002, 0.2, "needle off its path at which dispensing waits for the arm")] = 0.02
+    astray: Annotated[float, spec("m", 0.002, 0.2, "needle off its path at which dispensing waits")] = 0.03
     stop_acceleration: Annotated[float, spec("m/s^2", 0.1, 3.0, "mean deceleration of a broken-off motion")] = 0.5
 
 
@@ -314,12 +314,15 @@ def step(
 
 
 def _astray(state: State, estimate: Estimate, params: AllParams) -> bool:
-    """The arm does not hold the needle where it is wanted, or is not heard: adhesive would land beside the crack.
+    """The needle is not where it is wanted, or the arm is not heard: adhesive would land beside the crack.
 
-    Where the base is does not count: the arm cannot help it.
+    Told in the plane of the arm: across it nobody can help.
     """
-    x, z, elevation = (a - b for a, b in zip(measured(estimate, 0.0, params.vehicle)[4:7], state.at[4:7], strict=True))
-    off = hypot(x, z) + params.vehicle.arm.needle * abs(elevation)
+    x, y, z, _, wx, wz, elevation, _ = (
+        a - b for a, b in zip(measured(estimate, 0.0, params.vehicle), state.at, strict=True)
+    )
+    ahead = x * cos(state.at[3]) + y * sin(state.at[3])
+    off = hypot(ahead + wx, z + wz) + params.vehicle.arm.needle * abs(elevation)
     return off > params.guidance.astray or estimate.age_servos > params.safety.servos_late
 
 
