@@ -78,7 +78,7 @@ class Params(Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = 0.0
     seek_speed: Annotated[float, spec("m/s", 0.002, 0.1, "speed with which it is looked for")] = 0.03
-    astray: Annotated[float, spec("m", 0.002, 0.2, "needle off its path at which dispensing waits")] = 0.03
+    astray: Annotated[float, spec("m", 0.002, 0.2, "needle on its path: dispensing goes on after silent servos")] = 0.03
     stop_acceleration: Annotated[float, spec("m/s^2", 0.1, 3.0, "mean deceleration of a broken-off motion")] = 0.5
 
 
@@ -127,6 +127,8 @@ class State(Struct, frozen=True, gc=False):
     """Pressing: the set force has been held for its time."""
     spare: float = -1.0
     """So much more than contact must have is felt, in the mean over ``FELT_OVER``, N; negative: no contact is felt."""
+    waiting: bool = False
+    """Dispensing waits: the servos were not heard, and the needle is not back on its path."""
 
 
 class Progress(Struct, frozen=True, gc=False):
@@ -265,7 +267,9 @@ def step(
             easing = -1.0
 
     ended = state.index >= len(state.legs)
-    waiting = leg is not None and leg.pumping and _astray(state, estimate, params)
+    # servos that were not heard may have let go, and the arm hangs: adhesive would land beside the crack
+    unheard = estimate.age_servos > params.safety.servos_late
+    waiting = leg is not None and leg.pumping and (unheard or (state.waiting and _astray(state, estimate, params)))
     if waiting:
         paused, state = True, replace(state, rate=ZERO, acceleration=ZERO)
     if not ended and not paused:
@@ -288,6 +292,7 @@ def step(
         state.moving,
         state.at, state.rate, state.acceleration, state.home, settled, clock, lift, press_time, state.press_start,
         force, easing, compliant, released_for, tare, state.along, state.felt, seeking, state.held, spare,
+        waiting,
     )  # fmt: skip
     arrived = ended and easing < 0.0 and settled >= own.settle_time and lift >= 1.0
     tare_begun = tare or phase is Phase.TARE
@@ -310,20 +315,16 @@ def step(
         state.along,
         own.seek_time <= 0.0 or seeking > own.seek_time,
     )
-    return state, _reference(state, params, acceleration, ahead, pressing, waiting), progress
+    return state, _reference(state, params, acceleration, ahead, pressing), progress
 
 
 def _astray(state: State, estimate: Estimate, params: AllParams) -> bool:
-    """The needle is not where it is wanted, or the arm is not heard: adhesive would land beside the crack.
-
-    Told in the plane of the arm: across it nobody can help.
-    """
+    """The needle is off its path, in the plane of the arm: across it the arm cannot help."""
     x, y, z, _, wx, wz, elevation, _ = (
         a - b for a, b in zip(measured(estimate, 0.0, params.vehicle), state.at, strict=True)
     )
     ahead = x * cos(state.at[3]) + y * sin(state.at[3])
-    off = hypot(ahead + wx, z + wz) + params.vehicle.arm.needle * abs(elevation)
-    return off > params.guidance.astray or estimate.age_servos > params.safety.servos_late
+    return hypot(ahead + wx, z + wz) + params.vehicle.arm.needle * abs(elevation) > params.guidance.astray
 
 
 def _spare(before: float, estimate: Estimate, params: AllParams, dt: float) -> float:
@@ -346,9 +347,7 @@ def _taken_back(t: float, state: State, params: Params) -> float:
     return state.press_start - (state.press_start + params.pull_back) * force_profile.quintic(t / params.force_down)
 
 
-def _reference(
-    state: State, params: AllParams, compliant: float, force_ahead: float, pressing: bool, waiting: bool = False
-) -> Reference:
+def _reference(state: State, params: AllParams, compliant: float, force_ahead: float, pressing: bool) -> Reference:
     x, y, z, yaw, wx, wz, elevation, pump = state.at
     vx, vy, vz, yaw_rate, vwx, vwz, elevation_rate, _ = state.rate
     ax, ay, az, yaw_acceleration, _, _, _, _ = state.acceleration
@@ -366,7 +365,7 @@ def _reference(
         (x, y, z), (vx, vy, vz), (ax, ay, az), yaw, yaw_rate, yaw_acceleration, (wx, wz), (vwx, vwz), elevation,
         elevation_rate, pump, own.gripper_open if open_gripper else own.gripper_closed, state.lift, state.force,
         force_ahead, pressing,
-        leg is not None and leg.pumping and not waiting, state.phase in AT_THE_PIPE, compliant, offset.velocity,
+        leg is not None and leg.pumping and not state.waiting, state.phase in AT_THE_PIPE, compliant, offset.velocity,
         offset.displacement,
     )  # fmt: skip
 
