@@ -84,7 +84,7 @@ def step(
 
     error, error_rate: q_p - q_pd and its rate, m and m/s, W. acceleration: of the reference, m/s^2, W.
     mass, weight: kg and N of the whole vehicle (C_p is zero for a mass-proportional M_p).
-    normal: unit horizontal direction into the pipe, W. contact: 0 in free flight to 1 when the force loop is
+    normal: unit horizontal direction of the press, W. contact: 0 in free flight to 1 when the force loop is
     closed. adapt: the vehicle flies. hold_normal: the tip is at the pipe, adaptation along the normal rests.
     force: desired compressive force, N. wind: disturbance as observed, the contact apart, N, W.
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import gc
 import os
 import sys
@@ -61,6 +62,7 @@ def left(stations: Stations) -> Left:
     seconds_until(lambda: not session.info.transports())
     seconds_until(lambda: stations.link._sessions.heard(time.monotonic_ns()) == ())
     gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)  # what was freed and kept for the next is not left behind
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return Left(
         pages * os.sysconf("SC_PAGE_SIZE"),

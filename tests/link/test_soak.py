@@ -21,8 +21,8 @@ WARM_UP = 10
 #: A flight may leave this in memory for good, bytes: what the recorder must remember of it to finish its file. A
 #: session of Zenoh that stays is several times as much.
 LEFT = 15_000
-#: How noisy the memory of a process is on a machine that is busy, bytes: pools of memory breathe, by 2.7 MB once.
-NOISE = 5_000_000
+#: How noisy the memory of a process is, bytes.
+NOISE = 1_500_000
 
 
 def soaked(folder: Path) -> list[Left]:

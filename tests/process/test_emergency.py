@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from groundstation.client import Client, StationSettings
 from groundstation.urgent import Urgent
 from onboard.core.types import Request
-from onboard.wire import Mission, Stop
+from onboard.wire import Mission, Outcome, Stop
 from tests.process.flying import flying
 from tests.realtime import REALTIME
 from tests.waiting import seconds_until
@@ -30,13 +30,18 @@ def station(port: int) -> StationSettings:
     return StationSettings(connect=(f"tcp/127.0.0.1:{port}",), station="anna", plain=True)
 
 
+def known(urgent: Urgent) -> None:
+    """The vehicle has answered over these connections, and its loop has taken part: clear of the pipe, it refuses."""
+    assert urgent.ask(Mission(Request.RETREAT), timeout=PATIENCE, settled=True).outcome is Outcome.REFUSED
+
+
 def test_a_kill_with_the_loop_stuck(tmp_path: Path) -> None:
     """The thread of the loop spins in Python; the motors stop in the air, and the joints let go."""
     port = free_port()
     with flying(tmp_path, f"link.listen=[tcp/127.0.0.1:{port}]") as flight, Urgent(station(port)) as urgent:
         flight.hover()
-        # any answer shows that the vehicle knows the connections: the order that follows is the first to find it stuck
-        urgent.ask(Mission(Request.RETREAT), timeout=PATIENCE)
+        # all connections are known to the vehicle, and the order that follows is the first that finds the loop stuck
+        known(urgent)
         flight.signal(signal.SIGUSR1)
         before = flight.look()
         asked = time.monotonic_ns()
@@ -58,7 +63,7 @@ def test_a_stop_with_the_loop_stuck(tmp_path: Path) -> None:
         Client(replace(station(port), station="bob"), timeout=PATIENCE) as bob,
     ):
         flight.hover()
-        urgent.ask(Mission(Request.RETREAT), timeout=PATIENCE)
+        known(urgent)
         flight.signal(signal.SIGUSR1)
         before = flight.look()
         asked = time.monotonic_ns()
